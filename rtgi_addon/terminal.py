@@ -1,0 +1,216 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a bake says while it runs: a bar on a terminal, JSON lines for programs, plain lines otherwise. No bpy here.
+
+Blender writes to the C-level stdout as it pleases, so :func:`own_stdout` keeps the real one for these lines and
+sends everything else to stderr. A reader that goes away (``| head``) ends the talking, not the work.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol, TextIO
+
+from tqdm import tqdm
+
+#: A stage that reports faster than this is thinned out; its first and last report always pass.
+SECONDS_BETWEEN_REPORTS = 0.1
+
+
+class Listener(Protocol):
+    """Who hears of a bake. All calls come from the thread that bakes."""
+
+    def report(self, stage: str, done: int, total: int) -> None: ...
+
+    def frame_begins(self, frame: int, index: int, count: int) -> None: ...
+
+    def frame_done(self, frame: int, record: dict[str, Any]) -> None: ...
+
+    def warn(self, text: str) -> None: ...
+
+    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+        """The last call. ``event`` is done, cancelled, failed or refused; ``lines`` say it in words."""
+
+
+class Quiet:
+    """Hears and says nothing, for callers from Python."""
+
+    def report(self, stage: str, done: int, total: int) -> None: ...
+
+    def frame_begins(self, frame: int, index: int, count: int) -> None: ...
+
+    def frame_done(self, frame: int, record: dict[str, Any]) -> None: ...
+
+    def warn(self, text: str) -> None: ...
+
+    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None: ...
+
+
+class Stream:
+    """Text lines to a file that may be closed at the far end; after that, silence."""
+
+    def __init__(self, file: TextIO) -> None:
+        self._file: TextIO | None = file
+
+    def line(self, text: str) -> None:
+        if self._file is None:
+            return
+        try:
+            self._file.write(text + "\n")
+            self._file.flush()
+        except (
+            BrokenPipeError,
+            ValueError,
+        ):  # the reader left; ValueError: the file is closed
+            self._file = None
+
+
+class JsonLines:
+    """One JSON object per line: ``{"event": "progress" | "frame" | "warning" | "done" | ..., ...}``."""
+
+    def __init__(self, out: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
+        self._out, self._clock = Stream(out), clock
+        self._stage, self._said, self._frame = "", -1.0, None
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        now = self._clock()
+        if stage == self._stage and done < total and now - self._said < SECONDS_BETWEEN_REPORTS:
+            return
+        self._stage, self._said = stage, now
+        frame = {} if self._frame is None else {"frame": self._frame}
+        self._say("progress", stage=stage, done=done, total=total, **frame)
+
+    def frame_begins(self, frame: int, index: int, count: int) -> None:
+        self._frame = frame
+        self._stage = ""
+        self._say("frame_begins", frame=frame, index=index, count=count)
+
+    def frame_done(self, frame: int, record: dict[str, Any]) -> None:
+        self._say("frame", frame=frame, **record)
+
+    def warn(self, text: str) -> None:
+        self._say("warning", text=text)
+
+    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+        self._say(event, **fields, lines=lines)
+
+    def _say(self, event: str, **fields: Any) -> None:
+        self._out.line(json.dumps({"event": event, **fields}, allow_nan=False))
+
+
+class Plain:
+    """A line per stage and frame on stderr, the summary on stdout: for logs."""
+
+    def __init__(self, out: TextIO, log: TextIO) -> None:
+        self._out, self._log = Stream(out), Stream(log)
+        self._stage, self._place = "", ""
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        if stage != self._stage:
+            self._stage = stage
+            self._log.line(f"{self._place}{stage}")
+
+    def frame_begins(self, frame: int, index: int, count: int) -> None:
+        self._place, self._stage = f"frame {frame} ({index + 1}/{count}): ", ""
+
+    def frame_done(self, frame: int, record: dict[str, Any]) -> None:
+        self._log.line(f"{self._place}{describe(record)}")
+
+    def warn(self, text: str) -> None:
+        self._log.line(f"warning: {text}")
+
+    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+        for text in lines:
+            (self._out if event == "done" else self._log).line(text)
+
+
+class Bar:
+    """Two bars on a terminal: frames with the time left, and the stage at work."""
+
+    def __init__(self, out: TextIO, terminal: TextIO) -> None:
+        self._out, self._terminal = Stream(out), terminal
+        self._frames: tqdm[Any] | None = None
+        self._stage = tqdm(
+            file=terminal,
+            leave=False,
+            position=0,
+            bar_format="{desc:<20} {bar:24} {n_fmt}/{total_fmt} {remaining}",
+        )
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        if self._stage.desc != stage or self._stage.total != total or done < self._stage.n:
+            self._stage.reset(total)
+            self._stage.set_description_str(stage, refresh=False)
+        self._stage.update(done - self._stage.n)
+        if done >= total:
+            self._stage.refresh()
+
+    def frame_begins(self, frame: int, index: int, count: int) -> None:
+        if self._frames is None:
+            self._frames = tqdm(
+                total=count,
+                initial=index,
+                file=self._terminal,
+                leave=False,
+                position=1,
+                bar_format="{desc:<20} {bar:24} {n_fmt}/{total_fmt} {elapsed} < {remaining}",
+            )
+        self._frames.n = index
+        self._frames.set_description_str(f"frame {frame}")
+
+    def frame_done(self, frame: int, record: dict[str, Any]) -> None:
+        if self._frames is not None:
+            self._frames.update(1)
+
+    def warn(self, text: str) -> None:
+        tqdm.write(f"warning: {text}", file=self._terminal)
+
+    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+        self._stage.close()
+        if self._frames is not None:
+            self._frames.close()
+        for text in lines:
+            (self._out if event == "done" else Stream(self._terminal)).line(text)
+
+
+def describe(record: dict[str, Any]) -> str:
+    """A frame's record in a few words."""
+    if record.get("kept"):
+        return "kept"
+    error = record.get("estimated_error")
+    return f"{sum(record['seconds'].values()):.2f} s" + ("" if error is None else f", estimated error {error:.1%}")
+
+
+def make_listener(out: TextIO, *, as_json: bool) -> JsonLines | Bar | Plain:
+    """The listener that suits where stdout (``out``) and stderr go."""
+    if as_json:
+        return JsonLines(out)
+    return Bar(out, sys.stderr) if sys.stderr.isatty() else Plain(out, sys.stderr)
+
+
+@contextmanager
+def own_stdout(*, hush: bool = False) -> Iterator[TextIO]:
+    """The real stdout as a text file; what others write to file descriptor 1 goes to stderr, or nowhere (``hush``)."""
+    sys.stdout.flush()
+    kept = os.dup(1)
+    other = os.open(os.devnull, os.O_WRONLY) if hush else os.dup(2)
+    os.dup2(other, 1)
+    os.close(other)
+    real = os.fdopen(os.dup(kept), "w", encoding="utf-8", newline="\n")
+    try:
+        yield real
+    finally:
+        try:
+            real.close()
+        except BrokenPipeError:
+            pass  # the reader left while the last line was buffered
+        try:
+            sys.stdout.flush()
+        except BrokenPipeError:
+            pass
+        os.dup2(kept, 1)
+        os.close(kept)
