@@ -2,3 +2,25 @@
 """RTGI for Blender. Free of bpy at import, so that the backend and the command line load without it."""
 
 from __future__ import annotations
+
+from typing import Any
+
+#: What Blender gave for each registered command; it wants the same thing back.
+_commands: list[Any] = []
+
+
+def register() -> None:
+    """Called by Blender when the extension is enabled."""
+    import bpy
+
+    from .cli import run
+
+    _commands.append(bpy.utils.register_cli_command("rtgi", run))
+
+
+def unregister() -> None:
+    """Called by Blender when the extension is disabled, and at exit."""
+    import bpy
+
+    while _commands:
+        bpy.utils.unregister_cli_command(_commands.pop())

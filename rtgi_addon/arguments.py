@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arguments of ``rtgi bake`` and ``rtgi render``, the same for Blender's --command and for ``python -m rtgi_addon``.
+"""The arguments of ``rtgi bake`` and ``rtgi render``, the same for ``blender --command`` and ``python -m``.
 
 Options of a bake are made from the ``BakeSettings`` table, so that names, ranges and defaults have one owner.
 No bpy here, and nothing is done here: text in, plain values or a :class:`BakeError` out.
@@ -11,6 +11,7 @@ import argparse
 import re
 from collections.abc import Sequence
 from dataclasses import Field, fields
+from enum import EnumType
 from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
@@ -141,7 +142,7 @@ def _add_setting(group: Any, f: Field[Any], hint: Any) -> None:
 
 def _choices(hint: Any) -> list[str]:
     """The words an enumerated setting takes; none for numbers."""
-    return [member.value for member in hint] if isinstance(hint, type) and hasattr(hint, "__members__") else []
+    return [member.value for member in hint] if isinstance(hint, EnumType) else []
 
 
 def settings_of(arguments: argparse.Namespace) -> BakeSettings:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .backend.errors import BakeError
 
@@ -59,7 +60,7 @@ def write_json(path: Path, value: Any) -> None:
         )
 
 
-def write_arrays(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
+def write_arrays(path: Path, arrays: Iterable[tuple[str, NDArray[Any]]]) -> None:
     """An ``.npz`` written one array at a time, so that no more than one need be in memory."""
     with (
         whole_file(path) as part,
@@ -70,7 +71,7 @@ def write_arrays(path: Path, arrays: Iterable[tuple[str, np.ndarray]]) -> None:
             info = zipfile.ZipInfo(f"{name}.npy")
             info.compress_type = zipfile.ZIP_DEFLATED
             with archive.open(info, "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+                np.save(member, array, allow_pickle=False)
 
 
 def digest(value: Any) -> str:

@@ -12,7 +12,7 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any, Protocol, TextIO
 
 from tqdm import tqdm
@@ -74,15 +74,16 @@ class JsonLines:
 
     def __init__(self, out: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
         self._out, self._clock = Stream(out), clock
-        self._stage, self._said, self._frame = "", -1.0, None
+        self._stage, self._said = "", -1.0
+        self._frame: int | None = None
 
     def report(self, stage: str, done: int, total: int) -> None:
         now = self._clock()
         if stage == self._stage and done < total and now - self._said < SECONDS_BETWEEN_REPORTS:
             return
         self._stage, self._said = stage, now
-        frame = {} if self._frame is None else {"frame": self._frame}
-        self._say("progress", stage=stage, done=done, total=total, **frame)
+        place: dict[str, Any] = {} if self._frame is None else {"frame": self._frame}
+        self._say("progress", stage=stage, done=done, total=total, **place)
 
     def frame_begins(self, frame: int, index: int, count: int) -> None:
         self._frame = frame
@@ -204,13 +205,9 @@ def own_stdout(*, hush: bool = False) -> Iterator[TextIO]:
     try:
         yield real
     finally:
-        try:
+        with suppress(BrokenPipeError):  # the reader left while the last line was buffered
             real.close()
-        except BrokenPipeError:
-            pass  # the reader left while the last line was buffered
-        try:
+        with suppress(BrokenPipeError):
             sys.stdout.flush()
-        except BrokenPipeError:
-            pass
         os.dup2(kept, 1)
         os.close(kept)

@@ -231,7 +231,7 @@ def test_threads_do_not_hinder_resuming(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["{", "[]", '{"format": 99}', '{"frames": {}}'])
 def test_a_bake_json_that_is_not_ours_is_refused_with_its_name(tmp_path: Path, content: str) -> None:
     (tmp_path / "bake.json").write_text(content)
-    with pytest.raises(BakeError, match="bake.json"):
+    with pytest.raises(BakeError, match=r"bake\.json"):
         BakeFolder(tmp_path, HEADER, resume=True)
     assert (tmp_path / "bake.json").read_text() == content
 
