@@ -1,0 +1,39 @@
+#!/bin/sh
+# SPDX-License-Identifier: GPL-3.0-or-later
+# Make or refresh a virtual environment: tools/setup.sh FOLDER [BLENDER_VERSION]
+# Without a version: Blender 5.0 where there is a Python 3.11, else 5.2 where there is a 3.13.
+set -eu
+cd "$(dirname "$0")/.."
+
+# Print a Python of version $1 that starts. A pyenv shim on PATH may refuse to, so its versions are tried by folder.
+find_python() {
+    for python in "python$1" python3 python \
+        "${PYENV_ROOT:-$HOME/.pyenv}/versions/$1".*/bin/python \
+        "$HOME/.local/share/uv/python/cpython-$1".*/bin/python \
+        /usr/local/bin/python"$1" /usr/bin/python"$1" /opt/homebrew/bin/python"$1"; do
+        version=$("$python" -c 'import sys, venv; print("%d.%d" % sys.version_info[:2])' 2>/dev/null </dev/null) || continue
+        if [ "$version" = "$1" ]; then
+            echo "$python"
+            return 0
+        fi
+    done
+    return 1
+}
+
+folder=$1
+case ${2:-any} in
+    4.5 | 5.0) wanted="3.11:$2" ;;
+    5.2) wanted="3.13:$2" ;;
+    any) wanted="3.11:5.0 3.13:5.2" ;;
+    *)
+        echo "setup: no requirements for Blender $2; there are: 4.5, 5.0, 5.2" >&2
+        exit 2
+        ;;
+esac
+for pair in $wanted; do
+    if python=$(find_python "${pair%:*}"); then
+        exec "$python" tools/setup.py "$folder" "requirements/bpy-${pair#*:}.txt"
+    fi
+done
+echo "setup: no Python found for Blender ${2:-5.0 or 5.2} (Python:Blender $wanted); install one, for example: apt-get install python3.11 python3.11-venv" >&2
+exit 3
