@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Which pixels of the atlas a mesh's light-map triangles cover, and how much of each.
+
+One mesh at one size in pixels is rasterised once, however many instances show it. Every pixel that a triangle
+touches becomes a texel, so a ray that hits the triangle always finds one; a partly covered pixel says how
+much of it is surface and where the middle of that part lies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .scene import Bool, Float32, Float64, Int32
+
+#: Sub-samples per pixel side for coverage: 1/16 of a pixel's area is the smallest share told apart.
+SUBSAMPLES = 4
+#: Candidate (triangle, pixel) pairs worked on at a time, to bound memory.
+CHUNK_PAIRS = 1 << 20
+#: A pixel that a triangle enters by less than this is not touched: rectangle borders meet the pixel grid by rounding.
+TOUCH_PX = 2e-3
+#: A triangle whose pixel-space area is below this has no direction in the map.
+FLAT_AREA_PX = 1e-9
+
+
+@dataclass(frozen=True)
+class RasterTexels:
+    """Covered pixels of one mesh, n of them, row-major order. Pixel coordinates count from the rectangle's corner."""
+
+    row: Int32  # (n,)
+    col: Int32  # (n,)
+    triangle: Int32  # (n,) of the mesh: the one that stands for the pixel
+    barycentric: Float32  # (n, 2) weights of its second and third corner at the texel's sample point
+    coverage: Float32  # (n,) share of the pixel that is this island's surface, 0..1, never 0
+    extent: Float32  # (n, 2) size of the covered part along col and row, pixels
+
+
+def rasterise(corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
+    """Rasterise triangles ``corner_px`` (t, 3, 2), (col, row) in pixels, of islands (t,).
+
+    A pixel that two islands touch goes to the one covering more of it. Triangles without area in the map get the
+    pixel they fall on.
+    """
+    pairs = _covered_pairs(corner_px)
+    if not len(pairs.triangle):
+        none = np.zeros(0, np.int32)
+        return RasterTexels(none, none, none, np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
+    return _texels_of_pairs(pairs, corner_px, island_of_triangle)
+
+
+@dataclass(frozen=True)
+class _Pairs:
+    """(triangle, pixel) pairs that touch, with sums over the covered sub-samples."""
+
+    triangle: Int32
+    col: Int32
+    row: Int32
+    samples: Int32  # number of sub-samples covered, 0..16
+    sum_px: Float64  # (m, 2) sum of the covered sub-samples' coordinates
+    low: Float32  # (m, 2) smallest covered sub-sample coordinate within the pixel, 0..1
+    high: Float32
+    nearest: Float64  # (m, 2) point of the triangle nearest to the pixel's centre
+
+
+def _covered_pairs(corner_px: Float64) -> _Pairs:
+    low = np.floor(corner_px.min(axis=1)).astype(np.int64)  # (t, 2)
+    high = np.floor(corner_px.max(axis=1)).astype(np.int64)
+    # A maximum that lies exactly on a pixel border belongs to the pixel before it.
+    on_border = (corner_px.max(axis=1) == high) & (high > low)
+    size = np.where(on_border, high - low, high - low + 1)
+    count = size[:, 0] * size[:, 1]
+    ends = np.cumsum(count)
+    parts, start = [], 0
+    while start < len(corner_px):
+        base = ends[start - 1] if start else 0
+        stop = max(start + 1, int(np.searchsorted(ends, base + CHUNK_PAIRS, side="right")))
+        parts.append(_pairs_of(np.arange(start, stop), corner_px, low, size))
+        start = stop
+    return _Pairs(*(np.concatenate([getattr(p, f) for p in parts]) for f in _Pairs.__dataclass_fields__)) if parts else _Pairs(
+        *[np.zeros(0, np.int32)] * 4, *[np.zeros((0, 2))] * 4  # type: ignore[arg-type]
+    )
+
+
+def _pairs_of(triangles: Int32, corner_px: Float64, low: Int32, size: Int32) -> _Pairs:
+    count = (size[triangles, 0] * size[triangles, 1]).astype(np.int64)
+    triangle = np.repeat(triangles, count)
+    within = np.arange(len(triangle)) - np.repeat(np.cumsum(count) - count, count)
+    col = low[triangle, 0] + within % size[triangle, 0]
+    row = low[triangle, 1] + within // size[triangle, 0]
+    a, b, c = (corner_px[triangle, k] for k in range(3))
+    pixel = np.stack([col, row], axis=1).astype(np.float64)
+    edges = _edge_functions(a, b, c)
+    inside_all = np.ones(len(triangle), np.bool_)
+    outside = np.zeros(len(triangle), np.bool_)
+    for nx, ny, offset in edges:
+        at = nx * pixel[:, 0] + ny * pixel[:, 1] + offset
+        inside_all &= at + np.minimum(nx, 0) + np.minimum(ny, 0) >= 0  # the pixel's least corner
+        outside |= at + np.maximum(nx, 0) + np.maximum(ny, 0) < 0
+    keep = ~outside
+    triangle, pixel, inside_all = triangle[keep], pixel[keep], inside_all[keep]
+    edges = [(nx[keep], ny[keep], offset[keep]) for nx, ny, offset in edges]
+    samples = np.full(len(triangle), SUBSAMPLES * SUBSAMPLES, np.int32)
+    sum_px = (pixel + 0.5) * samples[:, None]
+    lo, hi = np.zeros((len(triangle), 2), np.float32), np.ones((len(triangle), 2), np.float32)
+    nearest = pixel + 0.5
+    part = np.nonzero(~inside_all)[0]
+    if len(part):
+        partial = [(nx[part], ny[part], offset[part]) for nx, ny, offset in edges]
+        samples[part], sum_px[part], lo[part], hi[part] = _subsample(pixel[part], partial)
+        tri = triangle[part]
+        nearest[part] = _nearest_points(pixel[part] + 0.5, corner_px[tri, 0], corner_px[tri, 1], corner_px[tri, 2])
+    touches = (samples > 0) | (np.abs(nearest - pixel - 0.5).max(axis=1) <= 0.5 - TOUCH_PX)
+    # A triangle that lies on a pixel border still needs a texel.
+    lost = np.bincount(triangle[touches] - triangles[0], minlength=len(triangles)) == 0
+    touches |= lost[triangle - triangles[0]] & (np.diff(triangle, prepend=-1) != 0)
+    col32, row32 = pixel[touches, 0].astype(np.int32), pixel[touches, 1].astype(np.int32)
+    return _Pairs(
+        triangle[touches].astype(np.int32), col32, row32, samples[touches], sum_px[touches],
+        lo[touches], hi[touches], nearest[touches],
+    )  # fmt: skip
+
+
+def _edge_functions(a: Float64, b: Float64, c: Float64) -> list[tuple[Float64, Float64, Float64]]:
+    """Three (nx, ny, offset) per triangle: non-negative inside, whatever the winding."""
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    sign = np.where(area < 0, -1.0, 1.0)
+    edges = []
+    for p, q in ((a, b), (b, c), (c, a)):
+        nx, ny = -(q[:, 1] - p[:, 1]) * sign, (q[:, 0] - p[:, 0]) * sign
+        edges.append((nx, ny, -(nx * p[:, 0] + ny * p[:, 1])))
+    return edges
+
+
+def _subsample(
+    pixel: Float64, edges: list[tuple[Float64, Float64, Float64]]
+) -> tuple[Int32, Float64, Float32, Float32]:
+    """Count, coordinate sum and bounds of the sub-samples inside all edges."""
+    steps = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES
+    dx, dy = (g.ravel() for g in np.meshgrid(steps, steps))  # (16,)
+    inside = np.ones((len(pixel), len(dx)), np.bool_)
+    for nx, ny, offset in edges:
+        at = (nx * pixel[:, 0] + ny * pixel[:, 1] + offset)[:, None]
+        inside &= at + nx[:, None] * dx + ny[:, None] * dy >= 0
+    count = inside.sum(axis=1).astype(np.int32)
+    sums = np.stack([np.where(inside, d, 0.0).sum(axis=1) for d in (dx, dy)], axis=1) + count[:, None] * pixel
+    half = 0.5 / SUBSAMPLES
+    low = np.stack([np.where(inside, d, 1.0).min(axis=1) for d in (dx, dy)], axis=1) - half
+    high = np.stack([np.where(inside, d, 0.0).max(axis=1) for d in (dx, dy)], axis=1) + half
+    return count, sums, low.astype(np.float32), high.astype(np.float32)
+
+
+def _nearest_points(p: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
+    """(m, 2) the point of each triangle nearest to ``p``; p itself where it lies inside."""
+    best, best_d2 = a.copy(), np.full(len(p), np.inf)
+    for q, r in ((a, b), (b, c), (c, a)):
+        edge = r - q
+        length2 = np.einsum("ij,ij->i", edge, edge)
+        s = np.divide(np.einsum("ij,ij->i", p - q, edge), length2, out=np.zeros_like(length2), where=length2 > 0)
+        point = q + edge * np.clip(s, 0, 1)[:, None]
+        d2 = np.einsum("ij,ij->i", point - p, point - p)
+        nearer = d2 < best_d2
+        best[nearer], best_d2[nearer] = point[nearer], d2[nearer]
+    inside = np.ones(len(p), np.bool_)
+    for nx, ny, offset in _edge_functions(a, b, c):
+        inside &= nx * p[:, 0] + ny * p[:, 1] + offset >= 0
+    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    inside &= np.abs(area) > FLAT_AREA_PX
+    best[inside] = p[inside]
+    return best
+
+
+def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
+    """One texel a pixel: its island by coverage, its triangle by nearness to the centre."""
+    island = island_of_triangle[pairs.triangle]
+    width = int(pairs.col.max()) + 1
+    pixel = pairs.row.astype(np.int64) * width + pairs.col
+    by_island = np.lexsort((island, pixel))
+    key_change = np.diff(pixel[by_island], prepend=-1) != 0
+    island_change = key_change | (np.diff(island[by_island], prepend=-1) != 0)
+    group = np.cumsum(island_change) - 1  # (m,) one a (pixel, island)
+    covered = np.bincount(group, weights=pairs.samples[by_island])
+    first = np.nonzero(island_change)[0]
+    # Of a pixel's islands the one covering more wins; lexsort is stable, so ties go to the lower island.
+    order = np.lexsort((np.arange(len(first)), -covered, pixel[by_island][first]))
+    winner = order[np.diff(pixel[by_island][first][order], prepend=-1) != 0]
+    texel_of_group = np.full(len(first), -1, np.int64)
+    texel_of_group[winner] = np.arange(len(winner))
+    texel = texel_of_group[group]
+    member = by_island[texel >= 0]
+    texel = texel[texel >= 0]
+    n = len(winner)
+
+    samples = np.bincount(texel, weights=pairs.samples[member], minlength=n)
+    offset = pairs.nearest[member] - np.stack([pairs.col[member], pairs.row[member]], axis=1) - 0.5
+    distance = np.einsum("ij,ij->i", offset, offset)
+    nearest_first = np.lexsort((pairs.triangle[member], distance, texel))
+    chosen = member[nearest_first[np.diff(texel[nearest_first], prepend=-1) != 0]]
+
+    low, high = np.ones((n, 2), np.float32), np.zeros((n, 2), np.float32)
+    np.minimum.at(low, texel, pairs.low[member])
+    np.maximum.at(high, texel, pairs.high[member])
+    centre = np.stack([np.bincount(texel, weights=pairs.sum_px[member, k], minlength=n) for k in (0, 1)], axis=1)
+    some = samples > 0
+    point = np.where(some[:, None], centre / np.maximum(samples, 1)[:, None], pairs.nearest[chosen])
+    corners = corner_px[pairs.triangle[chosen]]
+    # The middle of the covered part may lie on a neighbour; the nearest point of the chosen triangle stands for it.
+    point = _nearest_points(point, corners[:, 0], corners[:, 1], corners[:, 2])
+    smallest = 1.0 / (SUBSAMPLES * SUBSAMPLES)
+    return RasterTexels(
+        row=pairs.row[chosen],
+        col=pairs.col[chosen],
+        triangle=pairs.triangle[chosen],
+        barycentric=_barycentric(point, corners).astype(np.float32),
+        coverage=np.clip(samples * smallest, smallest, 1.0).astype(np.float32),
+        extent=np.where(some[:, None], high - low, 1.0 / SUBSAMPLES).astype(np.float32),
+    )
+
+
+def _barycentric(point: Float64, corners: Float64) -> Float64:
+    """(m, 2) weights of the second and third corner; flat triangles give the nearest along their longest edge."""
+    e1, e2, d = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], point - corners[:, 0]
+    det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    good = np.abs(det) > FLAT_AREA_PX
+    safe = np.where(good, det, 1.0)
+    u = np.where(good, (d[:, 0] * e2[:, 1] - d[:, 1] * e2[:, 0]) / safe, 1 / 3)
+    v = np.where(good, (e1[:, 0] * d[:, 1] - e1[:, 1] * d[:, 0]) / safe, 1 / 3)
+    u, v = np.clip(u, 0, 1), np.clip(v, 0, 1)
+    over = np.maximum(u + v, 1.0)
+    return np.stack([u / over, v / over], axis=1)
+
+
+def pixel_derivatives(corner_px: Float64) -> tuple[Float32, Bool]:
+    """((t, 2, 2), (t,)): [k] is the change of barycentric weight k + 1 for a step of one pixel in (col, row),
+    zero for triangles flat in the map; and which are not flat."""
+    e1, e2 = corner_px[:, 1] - corner_px[:, 0], corner_px[:, 2] - corner_px[:, 0]
+    det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    good = np.abs(det) > FLAT_AREA_PX
+    inverse = np.stack([np.stack([e2[:, 1], -e2[:, 0]], axis=1), np.stack([-e1[:, 1], e1[:, 0]], axis=1)], axis=1)
+    safe = np.where(good, det, 1.0)[:, None, None]
+    return np.where(good[:, None, None], inverse / safe, 0.0).astype(np.float32), good

@@ -1,0 +1,261 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Texels: the atlas pixels that are surface, where they lie in the world, and which one a ray hit belongs to.
+
+``Texels`` is fixed for a bake (it follows from meshes and atlas); ``TexelFrame`` is their place in one frame.
+Larsen04's maps are per hand-made surface; here a surface is one UV island of one side of one instance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .geometry import Geometry, unit
+from .rasterise import RasterTexels, pixel_derivatives, rasterise
+from .scene import Atlas, Bool, Float32, Float64, Int32, Material, Mesh, Placement, Scene
+
+FRONT, BACK = 0, 1
+#: The lookup image is widened by this many pixels, so that a hit on an island's border, moved over it by rounding,
+#: still finds the island's own texel.
+LOOKUP_BORDER_PX = 1
+
+
+@dataclass(frozen=True)
+class Texels:
+    """n texels in order of instance, side, row, col."""
+
+    page: Int32  # (n,)
+    row: Int32  # (n,) 0 is the bottom row
+    col: Int32  # (n,)
+    instance: Int32  # (n,)
+    side: Int32  # (n,) FRONT or BACK
+    surface: Int32  # (n,) 0..surface_count-1
+    surface_count: int
+    triangle: Int32  # (n,) scene-wide
+    barycentric: Float32  # (n, 2) weights of the triangle's second and third corner
+    derivative: Float32  # (n, 2, 2) change of those weights per pixel in (col, row), shrunk to the covered part
+    coverage: Float32  # (n,) share of the pixel that is surface
+    index: Int32  # (pages, H, W) texel of each pixel, -1 where there is none
+    lookup: Int32  # (pages * H * W,) `index` widened by LOOKUP_BORDER_PX within each island
+    hit_affine: Float32  # (2 * triangles, 3, 2) page pixel of corner 0 and its change along u and v; NaN without map
+    hit_page: Int32  # (2 * triangles,) first pixel of the page; rows of the back side follow all front ones
+
+    @property
+    def count(self) -> int:
+        return len(self.row)
+
+    @property
+    def valid(self) -> Bool:
+        """(pages, H, W) is the pixel a texel?"""
+        return self.index >= 0
+
+    def of_hits(self, triangle: Int32, u: Float32, v: Float32, back: Bool) -> Int32:
+        """(m,) texel that a hit lies in; -1 where ``triangle`` is -1 or that side has no map."""
+        height, width = self.index.shape[1:]
+        row_of_side = triangle + back * np.int32(len(self.hit_page) // 2)
+        affine = self.hit_affine.take(row_of_side, axis=0, mode="clip")  # (m, 3, 2)
+        at = affine[:, 0] + affine[:, 1] * u[:, None] + affine[:, 2] * v[:, None]
+        has_map = np.isfinite(at[:, 0]) & (triangle >= 0)
+        cell = np.where(has_map[:, None], at, np.float32(0)).astype(np.int32)
+        np.clip(cell[:, 0], 0, width - 1, out=cell[:, 0])
+        np.clip(cell[:, 1], 0, height - 1, out=cell[:, 1])
+        pixel = self.hit_page.take(row_of_side, mode="clip") + cell[:, 1] * width + cell[:, 0]
+        return np.where(has_map, self.lookup.take(pixel), np.int32(-1))
+
+    def to_pages(self, values: Float32) -> Float32:
+        """(pages, H, W, c) image of per-texel ``values`` (n, c); zero elsewhere."""
+        image = np.zeros((*self.index.shape, values.shape[1]), np.float32)
+        image[self.page, self.row, self.col] = values
+        return image
+
+
+@dataclass(frozen=True)
+class TexelFrame:
+    """Where the texels are in one frame; local space (see ``geometry``)."""
+
+    position: Float32  # (n, 3)
+    normal: Float32  # (n, 3) unit shading normal, out of the texel's own side
+    geometric_normal: Float32  # (n, 3) unit, out of the texel's own side
+    tangent_u: Float32  # (n, 3) m: the footprint's extent along col
+    tangent_v: Float32  # (n, 3) m: ... along row
+    area: Float32  # (n,) m²
+
+
+def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
+    """All texels of ``atlas``. Raises ValueError when a placement leaves its page."""
+    height = width = atlas.resolution
+    rasters: dict[tuple[int, float, float, float, float], RasterTexels] = {}
+    parts: list[dict[str, np.ndarray]] = []
+    affine = np.full((2 * geometry.triangle_count, 3, 2), np.nan, np.float32)
+    page_start = np.zeros(2 * geometry.triangle_count, np.int32)
+    surface_count = 0
+    for number, instance in enumerate(scene.instances):
+        mesh = scene.meshes[instance.mesh]
+        for side, placement in ((FRONT, atlas.front[number]), (BACK, atlas.back[number])):
+            if placement is None or not mesh.triangle_count or not instance.receives_light:
+                continue
+            corner_px = _corner_px(mesh, placement, atlas.resolution)
+            if corner_px.min() < -1e-3 or corner_px.max() > atlas.resolution + 1e-3:
+                raise ValueError(f"{instance.name}: its atlas rectangle leaves page {placement.page}")
+            whole = np.floor(corner_px.min(axis=(0, 1)))
+            start = corner_px - whole
+            key = (instance.mesh, *placement.scale, *(start[0, 0]))
+            if key not in rasters:
+                rasters[key] = rasterise(start, mesh.island_of_triangle)
+            rows = slice(side * geometry.triangle_count, (side + 1) * geometry.triangle_count)
+            triangles = geometry.triangles_of(number)
+            affine[rows][triangles] = _affine(corner_px)
+            page_start[rows][triangles] = placement.page * height * width
+            parts.append(
+                _place(rasters[key], start, mesh, placement, whole, number, side, triangles.start, surface_count)
+            )
+            surface_count += mesh.island_count
+    return _assemble(parts, atlas, affine, page_start, surface_count)
+
+
+def _corner_px(mesh: Mesh, placement: Placement, resolution: int) -> Float64:
+    uv = mesh.corner_uv.astype(np.float64) * placement.scale + placement.offset
+    return np.asarray(uv * resolution, np.float64)
+
+
+def _affine(corner_px: Float64) -> Float64:
+    origin = corner_px[:, 0]
+    return np.stack([origin, corner_px[:, 1] - origin, corner_px[:, 2] - origin], axis=1)
+
+
+def _place(
+    raster: RasterTexels, corner_px: Float64, mesh: Mesh, placement: Placement, whole: Float64,
+    instance: int, side: int, first_triangle: int, first_surface: int,
+) -> dict[str, np.ndarray]:  # fmt: skip
+    """The texels of one side of one instance, as columns of :class:`Texels`."""
+    count = len(raster.row)
+    derivative, _ = pixel_derivatives(corner_px)
+    # A partly covered pixel's footprint is the covered part, not the whole pixel.
+    shrunk = derivative[raster.triangle] * raster.extent[:, None, :]
+    return {
+        "page": np.full(count, placement.page, np.int32),
+        "row": raster.row + np.int32(whole[1]),
+        "col": raster.col + np.int32(whole[0]),
+        "instance": np.full(count, instance, np.int32),
+        "side": np.full(count, side, np.int32),
+        "surface": mesh.island_of_triangle[raster.triangle].astype(np.int32) + np.int32(first_surface),
+        "triangle": raster.triangle + np.int32(first_triangle),
+        "barycentric": raster.barycentric,
+        "derivative": shrunk.astype(np.float32),
+        "coverage": raster.coverage,
+    }
+
+
+def _assemble(
+    parts: list[dict[str, np.ndarray]], atlas: Atlas, affine: Float32, page_start: Int32, surface_count: int
+) -> Texels:
+    empty = {
+        "page": (0,), "row": (0,), "col": (0,), "instance": (0,), "side": (0,), "surface": (0,), "triangle": (0,),
+        "barycentric": (0, 2), "derivative": (0, 2, 2), "coverage": (0,),
+    }  # fmt: skip
+    floats = ("barycentric", "derivative", "coverage")
+    columns = {
+        name: np.concatenate([p[name] for p in parts])
+        if parts
+        else np.zeros(shape, np.float32 if name in floats else np.int32)
+        for name, shape in empty.items()
+    }
+    size = atlas.resolution
+    inside = (columns["row"] >= 0) & (columns["row"] < size) & (columns["col"] >= 0) & (columns["col"] < size)
+    columns = {name: column[inside] for name, column in columns.items()}
+    index = np.full((atlas.page_count, size, size), -1, np.int32)
+    # Where rectangles overlap (a user's own layer may), the first instance keeps the pixel.
+    order = np.arange(len(columns["row"]), dtype=np.int32)[::-1]
+    index[columns["page"][::-1], columns["row"][::-1], columns["col"][::-1]] = order
+    owner = index[columns["page"], columns["row"], columns["col"]] == np.arange(len(columns["row"]))
+    if not owner.all():
+        columns = {name: column[owner] for name, column in columns.items()}
+        index[:] = -1
+        index[columns["page"], columns["row"], columns["col"]] = np.arange(len(columns["row"]), dtype=np.int32)
+    lookup = _widened(index)
+    return Texels(
+        **columns,
+        surface_count=surface_count,
+        index=index,
+        lookup=lookup.reshape(-1),
+        hit_affine=affine,
+        hit_page=page_start,
+    )
+
+
+def _widened(index: Int32) -> Int32:
+    """``index`` with each free pixel taking a direct neighbour's texel, LOOKUP_BORDER_PX times."""
+    wide = index.copy()
+    for _ in range(LOOKUP_BORDER_PX):
+        before = np.pad(wide, ((0, 0), (1, 1), (1, 1)), constant_values=-1)
+        for dy, dx in ((1, 0), (1, 2), (0, 1), (2, 1), (0, 0), (0, 2), (2, 0), (2, 2)):
+            neighbour = before[:, dy : dy + index.shape[1], dx : dx + index.shape[2]]
+            np.copyto(wide, neighbour, where=wide < 0)
+    return wide
+
+
+def place_texels(texels: Texels, geometry: Geometry) -> TexelFrame:
+    """The texels' place in the frame that ``geometry`` stands in."""
+    corners = geometry.corners[texels.triangle]  # (n, 3, 3)
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    u, v = texels.barycentric[:, :1], texels.barycentric[:, 1:]
+    facing = np.where(texels.side == BACK, -1.0, 1.0).astype(np.float32)[:, None]
+    shading = geometry.corner_normals[texels.triangle]
+    normal = unit((shading[:, 0] * (1 - u - v) + shading[:, 1] * u + shading[:, 2] * v).astype(np.float64))
+    geometric = geometry.normals[texels.triangle]
+    # No shading normal (it vanished between opposite corners, or the mesh has none): the triangle's own.
+    lost = np.einsum("ij,ij->i", normal, normal) < 0.5
+    normal[lost] = geometric[lost]
+    step = texels.derivative
+    tangent_u = e1 * step[:, 0, :1] + e2 * step[:, 1, :1]
+    tangent_v = e1 * step[:, 0, 1:] + e2 * step[:, 1, 1:]
+    return TexelFrame(
+        position=corners[:, 0] + e1 * u + e2 * v,
+        normal=(normal * facing).astype(np.float32),
+        geometric_normal=geometric * facing,
+        tangent_u=tangent_u.astype(np.float32),
+        tangent_v=tangent_v.astype(np.float32),
+        area=_areas(texels, tangent_u, tangent_v, e1, e2),
+    )
+
+
+def _areas(texels: Texels, tangent_u: Float32, tangent_v: Float32, e1: Float32, e2: Float32) -> Float32:
+    """(n,) m²: the triangle's area per pixel times the share of the pixel that it covers."""
+    box = np.maximum(np.abs(np.cross(tangent_u.astype(np.float64), tangent_v)).max(axis=1), 0.0)
+    box = np.sqrt(np.einsum("ij,ij->i", *[np.cross(tangent_u.astype(np.float64), tangent_v)] * 2))
+    flat = np.abs(texels.derivative).max(axis=(1, 2)) == 0
+    own = 0.5 * np.sqrt(np.einsum("ij,ij->i", *[np.cross(e1.astype(np.float64), e2)] * 2))
+    return np.where(flat, own, box).astype(np.float32)
+
+
+def texel_colours(
+    texels: Texels, scene: Scene, geometry: Geometry, materials: tuple[Material, ...]
+) -> tuple[Float32, Float32]:
+    """((n, 3), (n, 3)): albedo and emitted radiance W/(m² sr) of each texel, from maps where a mesh has them."""
+    material = geometry.material_of_triangle[texels.triangle]
+    albedo = np.array([m.albedo for m in materials], np.float32).reshape(-1, 3)[material]
+    emission = np.array([m.emission for m in materials], np.float32).reshape(-1, 3)[material]
+    mesh_of_instance = np.array([i.mesh for i in scene.instances], np.int64)
+    mesh_of_texel = mesh_of_instance[texels.instance] if texels.count else np.zeros(0, np.int64)
+    for number, mesh in enumerate(scene.meshes):
+        if mesh.albedo_map is None and mesh.emission_map is None:
+            continue
+        rows = np.nonzero(mesh_of_texel == number)[0]
+        instance_start = geometry.first_triangle[texels.instance[rows]]
+        uv = mesh.corner_uv[texels.triangle[rows] - instance_start]  # (m, 3, 2)
+        u, v = texels.barycentric[rows, :1], texels.barycentric[rows, 1:]
+        at = uv[:, 0] * (1 - u - v) + uv[:, 1] * u + uv[:, 2] * v
+        if mesh.albedo_map is not None:
+            albedo[rows] = sample_map(mesh.albedo_map, at)
+        if mesh.emission_map is not None:
+            emission[rows] = sample_map(mesh.emission_map, at)
+    return albedo, emission
+
+
+def sample_map(image: Float32, uv: Float32) -> Float32:
+    """(m, 3) the pixels of ``image`` (h, w, 3) at ``uv`` (m, 2); nearest, since neighbours may be other islands."""
+    height, width = image.shape[:2]
+    col = np.clip((uv[:, 0] * width).astype(np.int64), 0, width - 1)
+    row = np.clip((uv[:, 1] * height).astype(np.int64), 0, height - 1)
+    return image[row, col]
