@@ -3,19 +3,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 #: What Blender gave for each registered command; it wants the same thing back.
 _commands: list[Any] = []
 
 
+def _rtgi(argv: Sequence[str]) -> int:
+    """``blender --command rtgi …``; what it needs is loaded when it is used, not when Blender starts."""
+    from .cli import run
+
+    return run(argv)
+
+
 def register() -> None:
     """Called by Blender when the extension is enabled."""
     import bpy
 
-    from .cli import run
-
-    _commands.append(bpy.utils.register_cli_command("rtgi", run))
+    _commands.append(bpy.utils.register_cli_command("rtgi", _rtgi))
 
 
 def unregister() -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import shutil
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -25,8 +26,8 @@ from .backend.errors import BakeError
 
 #: Raised when a reader of the old bake.json could no longer understand the new one.
 FORMAT = 1
-#: Files being written carry this prefix in the same folder, where renaming is atomic.
-PART = ".rtgi-part-"
+#: A file being written, in the same folder, where renaming is atomic; what a killed bake may leave.
+PART = re.compile(r"\.((iim|aim|caustics)\.p\d+\.\d+\.exr|bake\.json|texels\.npz|probe\.\d+)\.part")
 #: Settings that change the speed of a bake and not one bit of its maps.
 WITHOUT_EFFECT = ("threads",)
 #: An RGBA float32 pixel; compression is not counted on.
@@ -41,7 +42,7 @@ def map_name(kind: str, page: int, frame: int) -> str:
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
     """A name beside ``path`` to write to; becomes ``path`` if the block succeeds, vanishes otherwise."""
-    part = path.with_name(PART + path.name)
+    part = path.with_name(f".{path.name}.part")
     try:
         yield part
         with part.open("rb+") as file:
@@ -124,7 +125,7 @@ def folder_problems(folder: Path, bytes_needed: int = 0) -> list[str]:
         parent = parent.parent
     if not parent.is_dir():
         return [f"{parent}: is a file where --out {folder} needs a folder; give another folder"]
-    probe = parent / f"{PART}{os.getpid()}"
+    probe = parent / f".probe.{os.getpid()}.part"
     try:
         probe.touch()
         probe.unlink()
@@ -140,6 +141,14 @@ def folder_problems(folder: Path, bytes_needed: int = 0) -> list[str]:
 def map_bytes(*, frames: int, resolution: int, pages: int, kinds: int) -> int:
     """The most that the maps of a bake take on disk."""
     return frames * pages * kinds * resolution * resolution * BYTES_PER_PIXEL
+
+
+class FrameFailed(Exception):
+    """A frame could not be made or written; those before it stay. ``problems`` are lines as in BakeError."""
+
+    def __init__(self, *problems: str) -> None:
+        self.problems = problems
+        super().__init__("\n".join(problems))
 
 
 class BakeFolder:
@@ -163,8 +172,9 @@ class BakeFolder:
         self.record: dict[str, Any] = {**header, "status": "running", "frames": {}}
         self._finished: dict[str, Any] = {} if old is None else old["frames"]
         path.mkdir(parents=True, exist_ok=True)
-        for part in sorted(path.glob(PART + "*")):
-            part.unlink()
+        for part in path.iterdir():
+            if PART.fullmatch(part.name):
+                part.unlink()
         self._save()
 
     def finished_or_none(self, frame: int, state: str) -> dict[str, Any] | None:

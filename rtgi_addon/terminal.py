@@ -11,20 +11,28 @@ import json
 import os
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from typing import Any, Protocol, TextIO
+from typing import Any, TextIO
 
 from tqdm import tqdm
+
+from .backend.errors import Cancelled
 
 #: A stage that reports faster than this is thinned out; its first and last report always pass.
 SECONDS_BETWEEN_REPORTS = 0.1
 
 
-class Listener(Protocol):
-    """Who hears of a bake. All calls come from the thread that bakes."""
+class Listener:
+    """Hears of a bake and says nothing; the others say it. All calls come from the thread that bakes."""
 
-    def report(self, stage: str, done: int, total: int) -> None: ...
+    #: Set by whoever wants the bake to stop, from any thread or signal handler.
+    cancelled = False
+
+    def report(self, stage: str, done: int, total: int) -> None:
+        """Where the work is, as in ``backend.progress``."""
+        if self.cancelled:
+            raise Cancelled
 
     def frame_begins(self, frame: int, index: int, count: int) -> None: ...
 
@@ -32,22 +40,8 @@ class Listener(Protocol):
 
     def warn(self, text: str) -> None: ...
 
-    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+    def finish(self, event: str, fields: dict[str, Any], lines: Sequence[str]) -> None:
         """The last call. ``event`` is done, cancelled, failed or refused; ``lines`` say it in words."""
-
-
-class Quiet:
-    """Hears and says nothing, for callers from Python."""
-
-    def report(self, stage: str, done: int, total: int) -> None: ...
-
-    def frame_begins(self, frame: int, index: int, count: int) -> None: ...
-
-    def frame_done(self, frame: int, record: dict[str, Any]) -> None: ...
-
-    def warn(self, text: str) -> None: ...
-
-    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None: ...
 
 
 class Stream:
@@ -69,7 +63,7 @@ class Stream:
             self._file = None
 
 
-class JsonLines:
+class JsonLines(Listener):
     """One JSON object per line: ``{"event": "progress" | "frame" | "warning" | "done" | ..., ...}``."""
 
     def __init__(self, out: TextIO, clock: Callable[[], float] = time.monotonic) -> None:
@@ -78,6 +72,7 @@ class JsonLines:
         self._frame: int | None = None
 
     def report(self, stage: str, done: int, total: int) -> None:
+        super().report(stage, done, total)
         now = self._clock()
         if stage == self._stage and done < total and now - self._said < SECONDS_BETWEEN_REPORTS:
             return
@@ -96,14 +91,14 @@ class JsonLines:
     def warn(self, text: str) -> None:
         self._say("warning", text=text)
 
-    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
-        self._say(event, **fields, lines=lines)
+    def finish(self, event: str, fields: dict[str, Any], lines: Sequence[str]) -> None:
+        self._say(event, **fields, lines=list(lines))
 
     def _say(self, event: str, **fields: Any) -> None:
         self._out.line(json.dumps({"event": event, **fields}, allow_nan=False))
 
 
-class Plain:
+class Plain(Listener):
     """A line per stage and frame on stderr, the summary on stdout: for logs."""
 
     def __init__(self, out: TextIO, log: TextIO) -> None:
@@ -111,6 +106,7 @@ class Plain:
         self._stage, self._place = "", ""
 
     def report(self, stage: str, done: int, total: int) -> None:
+        super().report(stage, done, total)
         if stage != self._stage:
             self._stage = stage
             self._log.line(f"{self._place}{stage}")
@@ -124,12 +120,12 @@ class Plain:
     def warn(self, text: str) -> None:
         self._log.line(f"warning: {text}")
 
-    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+    def finish(self, event: str, fields: dict[str, Any], lines: Sequence[str]) -> None:
         for text in lines:
             (self._out if event == "done" else self._log).line(text)
 
 
-class Bar:
+class Bar(Listener):
     """Two bars on a terminal: frames with the time left, and the stage at work."""
 
     def __init__(self, out: TextIO, terminal: TextIO) -> None:
@@ -143,6 +139,7 @@ class Bar:
         )
 
     def report(self, stage: str, done: int, total: int) -> None:
+        super().report(stage, done, total)
         if self._stage.desc != stage or self._stage.total != total or done < self._stage.n:
             self._stage.reset(total)
             self._stage.set_description_str(stage, refresh=False)
@@ -170,7 +167,7 @@ class Bar:
     def warn(self, text: str) -> None:
         tqdm.write(f"warning: {text}", file=self._terminal)
 
-    def finish(self, event: str, fields: dict[str, Any], lines: list[str]) -> None:
+    def finish(self, event: str, fields: dict[str, Any], lines: Sequence[str]) -> None:
         self._stage.close()
         if self._frames is not None:
             self._frames.close()
@@ -186,7 +183,7 @@ def describe(record: dict[str, Any]) -> str:
     return f"{sum(record['seconds'].values()):.2f} s" + ("" if error is None else f", estimated error {error:.1%}")
 
 
-def make_listener(out: TextIO, *, as_json: bool) -> JsonLines | Bar | Plain:
+def make_listener(out: TextIO, *, as_json: bool) -> Listener:
     """The listener that suits where stdout (``out``) and stderr go."""
     if as_json:
         return JsonLines(out)
