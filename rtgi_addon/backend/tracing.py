@@ -28,7 +28,12 @@ class Hits:
     u: Float32  # (n,) barycentric weight of the second corner
     v: Float32  # (n,) barycentric weight of the third corner
     distance: Float32  # (n,) in units of the direction's length
-    back: Bool  # (n,) the ray came from behind the surface
+    cosine: Float32  # (n,) geometric normal · direction; negative where the ray came from the front
+
+    @property
+    def back(self) -> Bool:
+        """(n,) the ray came from behind the surface."""
+        return self.cosine > 0
 
 
 class Tracer(Protocol):
@@ -81,13 +86,13 @@ class EmbreeTracer:
             return chunks[0]
         if not chunks:
             none = np.zeros(0, np.float32)
-            return Hits(np.zeros(0, np.int32), none, none, none, np.zeros(0, np.bool_))
+            return Hits(np.zeros(0, np.int32), none, none, none, none)
         return Hits(
             np.concatenate([c.triangle for c in chunks]),
             np.concatenate([c.u for c in chunks]),
             np.concatenate([c.v for c in chunks]),
             np.concatenate([c.distance for c in chunks]),
-            np.concatenate([c.back for c in chunks]),
+            np.concatenate([c.cosine for c in chunks]),
         )
 
     def occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
@@ -151,8 +156,7 @@ class EmbreeTracer:
             triangle[new] = part.triangle_of_primitive[found["primID"][new]]
             u[new], v[new], distance[new] = found["u"][new], found["v"][new], found["tfar"][new]
         normals = self._geometry.normals.take(triangle, axis=0, mode="clip")
-        back = np.einsum("ij,ij->i", normals, directions) > 0
-        return Hits(triangle, u, v, distance, back)
+        return Hits(triangle, u, v, distance, np.einsum("ij,ij->i", normals, directions))
 
     def _occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
         blocked = np.zeros(len(origins), np.bool_)
