@@ -142,7 +142,7 @@ def _add_setting(group: Any, f: Field[Any], hint: Any) -> None:
 
 def _choices(hint: Any) -> list[str]:
     """The words an enumerated setting takes; none for numbers."""
-    return [member.value for member in hint] if isinstance(hint, EnumType) else []
+    return [str(word) for word in hint] if isinstance(hint, EnumType) else []
 
 
 def settings_of(arguments: argparse.Namespace) -> BakeSettings:
@@ -163,8 +163,10 @@ def settings_of(arguments: argparse.Namespace) -> BakeSettings:
     return BakeSettings(**values)
 
 
-def frames_of(text: str) -> Sequence[int]:
-    """The frames that ``A``, ``A-B`` or ``A-B:STEP`` names, ascending."""
+def frames_of(text: str | None) -> Sequence[int] | None:
+    """The frames that ``A``, ``A-B`` or ``A-B:STEP`` names, ascending; None stays None."""
+    if text is None:
+        return None
     match = _FRAMES.fullmatch(text.strip())
     if match is None:
         raise BakeError(f"--frames {text}: not a range; write it as 12, 1-24 or 1-24:2")
@@ -180,8 +182,10 @@ def frames_of(text: str) -> Sequence[int]:
     return range(first, last + 1, step)
 
 
-def size_of(text: str) -> tuple[int, int]:
-    """(width, height) in pixels of ``WxH``."""
+def size_of(text: str | None) -> tuple[int, int] | None:
+    """(width, height) in pixels of ``WxH``; None stays None."""
+    if text is None:
+        return None
     match = _SIZE.fullmatch(text.strip().lower())
     if match is None or not all(4 <= int(side) <= 16384 for side in match.groups()):
         raise BakeError(f"--resolution {text}: not a picture size; write it as 1280x720, sides from 4 to 16384")
