@@ -38,7 +38,7 @@ def main() -> None:
     options = parser.parse_args()
     manifest = tomllib.loads(MANIFEST.read_text())
     for name in manifest["platforms"] if options.platform == "all" else [options.platform]:
-        wheels = [path for path in manifest["wheels"] if re.search(WHEEL_TAGS[name] + r"\.whl$", path)]
+        wheels = [path for path in manifest["wheels"] if re.search(rf"-({WHEEL_TAGS[name]}|any)\.whl$", path)]
         fetch(wheels)
         if not options.only_wheels:
             say(f"built {build(name, wheels, options.output, manifest)}")
@@ -64,8 +64,10 @@ def download(wheel: Path) -> None:
     project, version, python, _abi, tags = wheel.stem.split("-")
     say(f"fetching {wheel.name}")
     command = [sys.executable, "-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    command += ["--only-binary", ":all:", "--implementation", "cp", "--python-version", python.removeprefix("cp")]
-    command += [option for tag in tags.split(".") for option in ("--platform", tag)]
+    command += ["--only-binary", ":all:"]
+    if tags != "any":
+        command += ["--implementation", "cp", "--python-version", python.removeprefix("cp")]
+        command += [option for tag in tags.split(".") for option in ("--platform", tag)]
     with tempfile.TemporaryDirectory() as folder:
         command += ["--dest", folder, f"{project}=={version}"]
         if subprocess.run(command, stdin=subprocess.DEVNULL, check=False).returncode != 0:
