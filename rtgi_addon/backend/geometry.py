@@ -67,6 +67,12 @@ class Geometry:
                 changed.append(index)
         return changed
 
+    def points(self, triangle: Int32, u: Float32, v: Float32) -> Float32:
+        """(n, 3) local points at barycentric weights u, v of ``triangle``'s second and third corner."""
+        corners = self.corners.take(triangle, axis=0)
+        a = corners[:, 0]
+        return np.asarray(a + (corners[:, 1] - a) * u[:, None] + (corners[:, 2] - a) * v[:, None], np.float32)
+
     def offset_length(self, positions: Float32) -> Float32:
         """(n,) m: how far a ray's origin is lifted off its surface at ``positions`` (n, 3)."""
         return np.abs(positions).max(axis=1, initial=0.0) * np.float32(OFFSET_OF_COORDINATE) + np.float32(

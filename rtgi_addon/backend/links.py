@@ -5,6 +5,7 @@ Each texel sends ``cosine`` rays that follow the cosine and ``bright`` ones aime
 texel or a patch of sky. A link's weight is the balance heuristic's (Veach and Guibas 1995): with p_c = cosθ/π and
 p_b the density of the aimed samples at the same direction, every sample weighs p_c / (n_c p_c + n_b p_b), whichever
 way it was made; so weights are bounded by 1/n_c and the irradiance is the plain sum of weight times radiosity.
+Behind a mirror, glass or a see-through surface only cosine rays go on; what they find weighs throughput / n_c.
 
 Since ∫ p_c = 1 the weights of a texel's rays, escaped ones included, must sum to one; each row is divided by its sum
 (a ratio estimator: exact for a uniform field, and free of the noise in the sum).
@@ -12,7 +13,7 @@ Since ∫ p_c = 1 the weights of a texel's rays, escaped ones included, must sum
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from scipy import sparse
@@ -20,12 +21,13 @@ from scipy import sparse
 from .geometry import Geometry
 from .parallel import CHUNK_RAYS, Workers
 from .patterns import bright_patterns, cosine_patterns, pattern_of_texels
-from .sampling import frames
+from .sampling import frames, hash_keys, unit_float32
+from .scatter import ABSORBED, Surfaces, scatter
 from .scene import Bool, Float32, Float64, Int32
 from .settings import SampleCounts
 from .sky import Sky
 from .texels import TexelFrame, Texels
-from .tracing import Tracer
+from .tracing import Hits, Tracer
 
 NO_TARGET = -1
 #: A texel most of whose rays start inside other geometry is under it: not valid, filled from its neighbours.
@@ -50,12 +52,18 @@ class Links:
 
     matrix: sparse.csr_matrix  # (n, m) float32, rows sum to the share of rays that ended on a target
     halves: tuple[sparse.csr_matrix, sparse.csr_matrix]  # the matrix from either half of the rays alone
+    beyond: tuple[sparse.csr_matrix, ...]  # three (n, m), one a channel: by mirror and glass; () where there are none
     valid: Bool  # (n,) False: the texel lies under other geometry
     rays: int
 
-    def irradiance(self, radiosity: Float32) -> Float32:
-        """(n, 3) W/m² from the radiosity (m, 3) of all targets."""
-        return np.asarray(self.matrix @ radiosity, np.float32)
+    def irradiance(self, radiosity: Float32, *, half: int | None = None) -> Float32:
+        """(n, 3) W/m² from the radiosity (m, 3) of all targets; ``half`` 0 or 1: estimated from that half's rays."""
+        matrix = self.matrix if half is None else self.halves[half]
+        direct = np.asarray(matrix @ radiosity, np.float32)
+        if self.beyond:
+            # Both halves share these rays; their noise is not in the difference of the halves.
+            direct += np.stack([m @ radiosity[:, k] for k, m in enumerate(self.beyond)], axis=1)
+        return direct
 
 
 def bright_targets(radiosity: Float32, area: Float32, sky: Sky | None, extent: float) -> BrightTargets:
@@ -79,15 +87,36 @@ def bright_targets(radiosity: Float32, area: Float32, sky: Sky | None, extent: f
     return BrightTargets((weight / total).astype(np.float32), cdf)
 
 
+@dataclass(frozen=True)
+class TracedLinks:
+    """Links of m texels, K rays each, cosine rays first; and of their rays' ways on behind mirrors."""
+
+    target: Int32  # (m, K)
+    weight: Float32  # (m, K)
+    usable: Bool  # (m, K) False: the ray starts inside geometry, or leaves below the surface
+    beyond_row: Int32  # (b,) texel
+    beyond_target: Int32  # (b,)
+    beyond_weight: Float32  # (b, 3)
+    rays: int
+
+    @staticmethod
+    def join(parts: list[TracedLinks]) -> TracedLinks:
+        names = [f.name for f in fields(TracedLinks) if f.name != "rays"]
+        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
+        return TracedLinks(**columns, rays=sum(p.rays for p in parts))
+
+
 class LinkTracer:
     """Traces links of any range of texels; holds what all ranges share."""
 
     def __init__(
-        self, texels: Texels, frame: TexelFrame, geometry: Geometry, tracer: Tracer, sky: Sky | None,
-        bright: BrightTargets, samples: SampleCounts, *, seed: int,
+        self, texels: Texels, frame: TexelFrame, geometry: Geometry, surfaces: Surfaces, tracer: Tracer,
+        sky: Sky | None, bright: BrightTargets, samples: SampleCounts, *, max_specular: int, seed: int,
     ) -> None:  # fmt: skip
         self._texels, self._frame, self._geometry, self._tracer = texels, frame, geometry, tracer
+        self._surfaces, self._max_specular = surfaces, max_specular
         self._sky, self._samples, self._seed = sky, samples, seed
+        self._see_through = bool(surfaces.passes.any())
         self._n_bright = samples.bright if bright.any else 0
         self._bright = bright
         # Density of aimed samples per solid angle: probability / area · distance² / cosine at the target.
@@ -99,15 +128,19 @@ class LinkTracer:
         self._tangents = frames(frame.normal)
         self._lift = geometry.offset_length(frame.position)
 
-    def trace(self, first: int, stop: int) -> tuple[Int32, Float32, Bool]:
-        """((m, K) target, (m, K) weight, (m, K) usable) of texels first..stop-1; cosine rays come first."""
+    def trace(self, first: int, stop: int) -> TracedLinks:
+        """The links of texels first..stop-1."""
         rows = slice(first, stop)
         pattern = pattern_of_texels(first, stop, self._seed)
-        parts = [self._cosine(rows, pattern)]
+        columns, hits, directions = self._cosine(rows, pattern)
+        parts, rays = [columns], columns[0].size
         if self._n_bright:
-            parts.append(self._aimed(rows, pattern))
+            aimed, cast = self._aimed(rows, pattern)
+            parts.append(aimed)
+            rays += cast
         target, weight, usable = (np.concatenate(column, axis=1) for column in zip(*parts, strict=True))
-        return target, weight, usable
+        row, beyond, throughput, cast = self._beyond(first, hits, columns[0].reshape(-1), directions)
+        return TracedLinks(target, weight, usable, row, beyond, throughput, rays + cast)
 
     def _starts(self, rows: slice, footprint: Float32) -> Float32:
         """(m, c, 3) ray origins spread over each texel's footprint."""
@@ -116,7 +149,7 @@ class LinkTracer:
         spread = footprint[:, :, :1] * f.tangent_u[rows, None] + footprint[:, :, 1:] * f.tangent_v[rows, None]
         return np.asarray(spread + lifted[:, None], np.float32)
 
-    def _cosine(self, rows: slice, pattern: Int32) -> tuple[Int32, Float32, Bool]:
+    def _cosine(self, rows: slice, pattern: Int32) -> tuple[tuple[Int32, Float32, Bool], Hits, Float32]:
         table = cosine_patterns(self._samples.cosine, self._seed)
         local = table.directions[pattern]  # (m, c, 3)
         axes = np.stack([self._tangents[0][rows], self._tangents[1][rows], self._frame.normal[rows]], axis=1)
@@ -126,23 +159,18 @@ class LinkTracer:
         flat_directions = directions.reshape(-1, 3)
         hits = self._tracer.intersect(origins.reshape(-1, 3), flat_directions)
         escaped = hits.triangle < 0
-        target = self._texels.of_hits(hits.triangle, hits.u, hits.v, hits.back)
+        target = self._targets(hits, flat_directions)
         dark_side = (target < 0) & ~escaped
-        density = self._density.take(target, mode="clip")
-        distance2 = hits.distance * hits.distance
-        density = density * distance2 / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
-        if self._sky is not None and escaped.any():
-            patch = self._sky.of_directions(flat_directions[escaped])
-            target[escaped] = self._texels.count + patch
-            density[escaped] = self._density[self._texels.count + patch]
+        per_area = hits.distance * hits.distance / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
+        density = self._density.take(target, mode="clip") * np.where(escaped, np.float32(1), per_area)
         density[target < 0] = 0
         cosine = np.maximum(local[:, :, 2], np.float32(1e-6))
         n_c, n_b = np.float32(self._samples.cosine), np.float32(self._n_bright)
         weight = 1 / (n_c + n_b * np.float32(np.pi) * density.reshape(shape) / cosine)
         below = np.einsum("mcj,mj->mc", directions, self._frame.geometric_normal[rows]) <= 0
-        return target.reshape(shape), weight, ~(dark_side.reshape(shape) | below)
+        return (target.reshape(shape), weight, ~(dark_side.reshape(shape) | below)), hits, flat_directions
 
-    def _aimed(self, rows: slice, pattern: Int32) -> tuple[Int32, Float32, Bool]:
+    def _aimed(self, rows: slice, pattern: Int32) -> tuple[tuple[Int32, Float32, Bool], int]:
         table = bright_patterns(self._samples.bright, self._seed)
         points, normals, target_table = self._aims()
         target = target_table[pattern]  # (m, b)
@@ -163,7 +191,53 @@ class LinkTracer:
         ends = np.where(is_sky, np.float32(np.inf), np.float32(1)).reshape(-1)[at]
         hidden = self._tracer.occluded(origins.reshape(-1, 3)[at], ways.reshape(-1, 3)[at], ends)
         weight.reshape(-1)[at[hidden]] = 0
-        return target, weight.astype(np.float32), np.ones(weight.shape, np.bool_)
+        return (target, weight.astype(np.float32), np.ones(weight.shape, np.bool_)), len(at)
+
+    def _beyond(
+        self, first: int, hits: Hits, target: Int32, directions: Float32
+    ) -> tuple[Int32, Int32, Float32, int]:
+        """((b,) texel, (b,) target, (b, 3) weight, rays): where rays go on from surfaces that pass them."""
+        none = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32), 0
+        if not self._see_through or self._max_specular == 0:
+            return none
+        ray = np.nonzero(self._goes_on(hits.triangle))[0]
+        hits, target, directions = hits.take(ray), target[ray], directions[ray]
+        throughput = np.full((len(ray), 3), 1 / self._samples.cosine, np.float32)
+        found, cast = [], 0
+        for depth in range(self._max_specular):
+            if not len(ray):
+                break
+            keys = [hash_keys(ray + first * self._samples.cosine, depth, k, self._seed) for k in range(3)]
+            position = self._geometry.points(hits.triangle, hits.u, hits.v)
+            numbers = [unit_float32(k) for k in keys]
+            after = scatter(self._surfaces, hits, target, position, directions, throughput, numbers, diffuse=False)
+            on = np.nonzero(after.kind != ABSORBED)[0]
+            ray, throughput, directions = ray[on], after.flux[on], after.direction[on]
+            hits = self._tracer.intersect(np.ascontiguousarray(after.origin[on]), np.ascontiguousarray(directions))
+            cast += len(ray)
+            target = self._targets(hits, directions)
+            row = (ray // self._samples.cosine + first).astype(np.int32)
+            ends = target != NO_TARGET
+            found.append((row[ends], target[ends], throughput[ends]))
+            goes_on = np.nonzero(self._goes_on(hits.triangle))[0]
+            ray, throughput, directions = ray[goes_on], throughput[goes_on], directions[goes_on]
+            target, hits = target[goes_on], hits.take(goes_on)
+        if not found:
+            return none
+        row, ended, weight = (np.concatenate(column) for column in zip(*found, strict=True))
+        return row, ended, weight, cast
+
+    def _goes_on(self, triangle: Int32) -> Bool:
+        material = self._surfaces.material_of_triangle.take(triangle, mode="clip")
+        return np.asarray(self._surfaces.passes.take(material) & (triangle >= 0))
+
+    def _targets(self, hits: Hits, directions: Float32) -> Int32:
+        """(r,) the target each ray ended on, texel or sky patch, or NO_TARGET."""
+        target = self._texels.of_hits(hits.triangle, hits.u, hits.v, hits.back)
+        if self._sky is not None:
+            escaped = hits.triangle < 0
+            target[escaped] = self._texels.count + self._sky.of_directions(directions[escaped])
+        return target
 
     def _aims(self) -> tuple[Float32, Float32, Int32]:
         """Per pattern: (P, b, 3) point on the target, lifted (or direction to the sky), (P, b, 3) its normal,
@@ -193,14 +267,31 @@ def trace_links(tracer: LinkTracer, texel_count: int, target_count: int, samples
     parts = workers.map_slices(lambda s: tracer.trace(s.start, s.stop), texel_count, chunk)
     if not parts:
         empty = sparse.csr_matrix((0, target_count), dtype=np.float32)
-        return Links(empty, (empty, empty), np.zeros(0, np.bool_), 0)
-    target, weight, usable = (np.concatenate(column) for column in zip(*parts, strict=True))
-    free = usable[:, : samples.cosine].mean(axis=1)
-    weight *= usable
-    rays = target.size
-    first = _first_half(target.shape[1], samples)
-    matrices = [_matrix(target, weight, columns, target_count) for columns in (slice(None), first, ~first)]
-    return Links(matrices[0], (matrices[1], matrices[2]), free >= LEAST_FREE_SHARE, rays)
+        return Links(empty, (empty, empty), (), np.zeros(0, np.bool_), 0)
+    traced = TracedLinks.join(parts)
+    free = traced.usable[:, : samples.cosine].mean(axis=1)
+    weight = traced.weight * traced.usable
+    first = _first_half(weight.shape[1], samples)
+    matrices = [_matrix(traced.target, weight, columns, target_count) for columns in (slice(None), first, ~first)]
+    beyond = _beyond_matrices(traced, weight, target_count) if len(traced.beyond_row) else ()
+    return Links(matrices[0], (matrices[1], matrices[2]), beyond, free >= LEAST_FREE_SHARE, traced.rays)
+
+
+def _beyond_matrices(traced: TracedLinks, weight: Float32, target_count: int) -> tuple[sparse.csr_matrix, ...]:
+    """One matrix a channel, its rows scaled as the plain links' are."""
+    scale = _row_scale(weight)
+    place = (traced.beyond_row, traced.beyond_target)
+    shape = (len(weight), target_count)
+    return tuple(
+        sparse.coo_matrix((traced.beyond_weight[:, k] * scale[traced.beyond_row], place), shape=shape).tocsr()
+        for k in range(3)
+    )
+
+
+def _row_scale(weight: Float32) -> Float32:
+    """(n,) what makes each row of ``weight`` (n, K) sum to one; 0 for a row of zeros."""
+    total = weight.sum(axis=1, dtype=np.float64)
+    return np.divide(1.0, total, out=np.zeros_like(total), where=total > 0).astype(np.float32)
 
 
 def _first_half(columns: int, samples: SampleCounts) -> Bool:
@@ -212,8 +303,7 @@ def _first_half(columns: int, samples: SampleCounts) -> Bool:
 def _matrix(target: Int32, weight: Float32, columns: slice | Bool, target_count: int) -> sparse.csr_matrix:
     """Rows scaled to sum to one over all rays, the ones that ended nowhere included."""
     target, weight = target[:, columns], weight[:, columns]
-    total = weight.sum(axis=1, dtype=np.float64)
-    scale = np.divide(1.0, total, out=np.zeros_like(total), where=total > 0).astype(np.float32)
+    scale = _row_scale(weight)
     kept = (weight > 0) & (target != NO_TARGET)
     start = np.concatenate([[0], np.cumsum(kept.sum(axis=1))]).astype(np.int32)
     data = (weight * scale[:, None])[kept]

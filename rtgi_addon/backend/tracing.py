@@ -14,6 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
+from numpy.typing import NDArray
 
 from .geometry import Geometry
 from .parallel import Workers
@@ -34,6 +35,10 @@ class Hits:
     def back(self) -> Bool:
         """(n,) the ray came from behind the surface."""
         return self.cosine > 0
+
+    def take(self, rows: NDArray[np.integer]) -> Hits:
+        """The hits of ``rows`` (k,), in that order."""
+        return Hits(*(column[rows] for column in (self.triangle, self.u, self.v, self.distance, self.cosine)))
 
 
 class Tracer(Protocol):
