@@ -14,11 +14,11 @@ import numpy as np
 
 from .links import Links
 from .scene import Float32
-from .solvers import bicgstab
+from .solvers import solve_fixed_point
 
 #: Relative residual of the solution: far below the noise of any sample count.
 TOLERANCE = 1e-4
-MOST_ITERATIONS = 200
+MOST_PRODUCTS = 200
 
 
 @dataclass(frozen=True)
@@ -44,10 +44,10 @@ def solve(links: Links, outside: Float32, albedo: Float32, emitted: Float32) -> 
     def bounce(x: Float32) -> Float32:
         return links.irradiance(_padded(albedo * x, len(emitted)))
 
-    solution = bicgstab(bounce, b, tolerance=TOLERANCE, most_iterations=MOST_ITERATIONS)
+    solution = solve_fixed_point(bounce, b, tolerance=TOLERANCE, max_products=MOST_PRODUCTS)
     aim = np.maximum(solution.x, 0).astype(np.float32)
     iim = gather(links, aim, albedo, emitted)
-    return Illumination(aim, iim, solution.products + 2, solution.residual)
+    return Illumination(aim, iim, solution.products + 2, float(solution.residual.max()))
 
 
 def gather(links: Links, aim: Float32, albedo: Float32, emitted: Float32) -> Float32:

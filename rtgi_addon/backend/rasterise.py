@@ -8,7 +8,7 @@ much of it is surface and where the middle of that part lies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -34,6 +34,9 @@ class RasterTexels:
     barycentric: Float32  # (n, 2) weights of its second and third corner at the texel's sample point
     coverage: Float32  # (n,) share of the pixel that is this island's surface, 0..1, never 0
     extent: Float32  # (n, 2) size of the covered part along col and row, pixels
+    pair_texel: Int32  # (m,) texel and triangle of each overlap,
+    pair_triangle: Int32  # (m,)
+    pair_share: Float32  # (m,) and how much of the triangle's area lies there; sums to one over a triangle
 
 
 def rasterise(corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
@@ -44,8 +47,8 @@ def rasterise(corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
     """
     pairs = _covered_pairs(corner_px)
     if not len(pairs.triangle):
-        none = np.zeros(0, np.int32)
-        return RasterTexels(none, none, none, np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 2), np.float32))
+        none, nothing, no_pair = np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 2), np.float32)
+        return RasterTexels(none, none, none, no_pair, nothing, no_pair, none, none, nothing)
     return _texels_of_pairs(pairs, corner_px, island_of_triangle)
 
 
@@ -77,9 +80,9 @@ def _covered_pairs(corner_px: Float64) -> _Pairs:
         stop = max(start + 1, int(np.searchsorted(ends, base + CHUNK_PAIRS, side="right")))
         parts.append(_pairs_of(np.arange(start, stop), corner_px, low, size))
         start = stop
-    return _Pairs(*(np.concatenate([getattr(p, f) for p in parts]) for f in _Pairs.__dataclass_fields__)) if parts else _Pairs(
-        *[np.zeros(0, np.int32)] * 4, *[np.zeros((0, 2))] * 4  # type: ignore[arg-type]
-    )
+    if not parts:
+        parts = [_pairs_of(np.zeros(0, np.int64), corner_px, low, size)]
+    return _Pairs(*(np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(_Pairs)))
 
 
 def _pairs_of(triangles: Int32, corner_px: Float64, low: Int32, size: Int32) -> _Pairs:
@@ -112,8 +115,9 @@ def _pairs_of(triangles: Int32, corner_px: Float64, low: Int32, size: Int32) -> 
         nearest[part] = _nearest_points(pixel[part] + 0.5, corner_px[tri, 0], corner_px[tri, 1], corner_px[tri, 2])
     touches = (samples > 0) | (np.abs(nearest - pixel - 0.5).max(axis=1) <= 0.5 - TOUCH_PX)
     # A triangle that lies on a pixel border still needs a texel.
-    lost = np.bincount(triangle[touches] - triangles[0], minlength=len(triangles)) == 0
-    touches |= lost[triangle - triangles[0]] & (np.diff(triangle, prepend=-1) != 0)
+    first = triangles[0] if len(triangles) else 0
+    lost = np.bincount(triangle[touches] - first, minlength=len(triangles)) == 0
+    touches |= lost[triangle - first] & (np.diff(triangle, prepend=-1) != 0)
     col32, row32 = pixel[touches, 0].astype(np.int32), pixel[touches, 1].astype(np.int32)
     return _Pairs(
         triangle[touches].astype(np.int32), col32, row32, samples[touches], sum_px[touches],
@@ -137,13 +141,15 @@ def _subsample(
 ) -> tuple[Int32, Float64, Float32, Float32]:
     """Count, coordinate sum and bounds of the sub-samples inside all edges."""
     steps = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES
-    dx, dy = (g.ravel() for g in np.meshgrid(steps, steps))  # (16,)
+    # Slightly off the grid, differently in x and y: no sample lies on the edges that artists draw (45°, axis-parallel),
+    # where both neighbours would claim it.
+    dx, dy = (g.ravel() for g in np.meshgrid(steps + 1.1e-3, steps - 0.7e-3))  # (16,)
     inside = np.ones((len(pixel), len(dx)), np.bool_)
     for nx, ny, offset in edges:
         at = (nx * pixel[:, 0] + ny * pixel[:, 1] + offset)[:, None]
         inside &= at + nx[:, None] * dx + ny[:, None] * dy >= 0
     count = inside.sum(axis=1).astype(np.int32)
-    sums = np.stack([np.where(inside, d, 0.0).sum(axis=1) for d in (dx, dy)], axis=1) + count[:, None] * pixel
+    sums = np.stack([inside @ dx, inside @ dy], axis=1) + count[:, None] * pixel
     half = 0.5 / SUBSAMPLES
     low = np.stack([np.where(inside, d, 1.0).min(axis=1) for d in (dx, dy)], axis=1) - half
     high = np.stack([np.where(inside, d, 0.0).max(axis=1) for d in (dx, dy)], axis=1) + half
@@ -203,10 +209,17 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
     centre = np.stack([np.bincount(texel, weights=pairs.sum_px[member, k], minlength=n) for k in (0, 1)], axis=1)
     some = samples > 0
     point = np.where(some[:, None], centre / np.maximum(samples, 1)[:, None], pairs.nearest[chosen])
+    whole = samples >= SUBSAMPLES * SUBSAMPLES
+    middle = np.stack([pairs.col[chosen], pairs.row[chosen]], axis=1) + 0.5
+    point[whole] = middle[whole]
+    low[whole], high[whole] = 0, 1
     corners = corner_px[pairs.triangle[chosen]]
     # The middle of the covered part may lie on a neighbour; the nearest point of the chosen triangle stands for it.
     point = _nearest_points(point, corners[:, 0], corners[:, 1], corners[:, 2])
     smallest = 1.0 / (SUBSAMPLES * SUBSAMPLES)
+    # A triangle between the sub-samples still has its area: it counts as a sliver of one.
+    part = np.maximum(pairs.samples[member], smallest)
+    of_triangle = np.bincount(pairs.triangle[member], weights=part)
     return RasterTexels(
         row=pairs.row[chosen],
         col=pairs.col[chosen],
@@ -214,6 +227,9 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
         barycentric=_barycentric(point, corners).astype(np.float32),
         coverage=np.clip(samples * smallest, smallest, 1.0).astype(np.float32),
         extent=np.where(some[:, None], high - low, 1.0 / SUBSAMPLES).astype(np.float32),
+        pair_texel=texel.astype(np.int32),
+        pair_triangle=pairs.triangle[member],
+        pair_share=(part / of_triangle[pairs.triangle[member]]).astype(np.float32),
     )
 
 

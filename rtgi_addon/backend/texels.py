@@ -7,9 +7,13 @@ Larsen04's maps are per hand-made surface; here a surface is one UV island of on
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy import sparse
 
 from .geometry import Geometry, unit
 from .rasterise import RasterTexels, pixel_derivatives, rasterise
@@ -36,6 +40,7 @@ class Texels:
     barycentric: Float32  # (n, 2) weights of the triangle's second and third corner
     derivative: Float32  # (n, 2, 2) change of those weights per pixel in (col, row), shrunk to the covered part
     coverage: Float32  # (n,) share of the pixel that is surface
+    share: sparse.csr_matrix  # (n, triangles) part of each triangle's area that is the texel's
     index: Int32  # (pages, H, W) texel of each pixel, -1 where there is none
     lookup: Int32  # (pages * H * W,) `index` widened by LOOKUP_BORDER_PX within each island
     hit_affine: Float32  # (2 * triangles, 3, 2) page pixel of corner 0 and its change along u and v; NaN without map
@@ -84,9 +89,8 @@ class TexelFrame:
 
 def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
     """All texels of ``atlas``. Raises ValueError when a placement leaves its page."""
-    height = width = atlas.resolution
-    rasters: dict[tuple[int, float, float, float, float], RasterTexels] = {}
-    parts: list[dict[str, np.ndarray]] = []
+    rasters: dict[tuple[object, ...], RasterTexels] = {}
+    parts: list[_Side] = []
     affine = np.full((2 * geometry.triangle_count, 3, 2), np.nan, np.float32)
     page_start = np.zeros(2 * geometry.triangle_count, np.int32)
     surface_count = 0
@@ -98,20 +102,35 @@ def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
             corner_px = _corner_px(mesh, placement, atlas.resolution)
             if corner_px.min() < -1e-3 or corner_px.max() > atlas.resolution + 1e-3:
                 raise ValueError(f"{instance.name}: its atlas rectangle leaves page {placement.page}")
-            whole = np.floor(corner_px.min(axis=(0, 1)))
+            whole = np.floor(corner_px.min(axis=(0, 1)) + 1e-3)
             start = corner_px - whole
-            key = (instance.mesh, *placement.scale, *(start[0, 0]))
+            key = (instance.mesh, *placement.scale, *np.round(start[0, 0], 3))
             if key not in rasters:
                 rasters[key] = rasterise(start, mesh.island_of_triangle)
-            rows = slice(side * geometry.triangle_count, (side + 1) * geometry.triangle_count)
             triangles = geometry.triangles_of(number)
-            affine[rows][triangles] = _affine(corner_px)
-            page_start[rows][triangles] = placement.page * height * width
-            parts.append(
-                _place(rasters[key], start, mesh, placement, whole, number, side, triangles.start, surface_count)
-            )
+            rows = slice(side * geometry.triangle_count + triangles.start, side * geometry.triangle_count + triangles.stop)
+            affine[rows] = _affine(corner_px)
+            page_start[rows] = placement.page * atlas.resolution**2
+            raster = rasters[key]
+            derivative = _footprint_derivative(start, raster)
+            parts.append(_Side(number, side, placement.page, whole, triangles.start, surface_count, raster, derivative))
             surface_count += mesh.island_count
-    return _assemble(parts, atlas, affine, page_start, surface_count)
+    columns, share = _columns(scene, parts, geometry.triangle_count)
+    return _on_pages(columns, share, atlas, surface_count, affine, page_start)
+
+
+@dataclass(frozen=True)
+class _Side:
+    """One mapped side of one instance."""
+
+    instance: int
+    side: int
+    page: int
+    whole: Float64  # (2,) page pixel (col, row) of the raster's first
+    first_triangle: int
+    first_surface: int
+    raster: RasterTexels
+    derivative: Float32  # (n, 2, 2)
 
 
 def _corner_px(mesh: Mesh, placement: Placement, resolution: int) -> Float64:
@@ -124,61 +143,73 @@ def _affine(corner_px: Float64) -> Float64:
     return np.stack([origin, corner_px[:, 1] - origin, corner_px[:, 2] - origin], axis=1)
 
 
-def _place(
-    raster: RasterTexels, corner_px: Float64, mesh: Mesh, placement: Placement, whole: Float64,
-    instance: int, side: int, first_triangle: int, first_surface: int,
-) -> dict[str, np.ndarray]:  # fmt: skip
-    """The texels of one side of one instance, as columns of :class:`Texels`."""
-    count = len(raster.row)
+def _footprint_derivative(corner_px: Float64, raster: RasterTexels) -> Float32:
+    """(n, 2, 2) change of barycentric weights per pixel; a partly covered pixel's footprint is its covered part."""
     derivative, _ = pixel_derivatives(corner_px)
-    # A partly covered pixel's footprint is the covered part, not the whole pixel.
-    shrunk = derivative[raster.triangle] * raster.extent[:, None, :]
-    return {
-        "page": np.full(count, placement.page, np.int32),
-        "row": raster.row + np.int32(whole[1]),
-        "col": raster.col + np.int32(whole[0]),
-        "instance": np.full(count, instance, np.int32),
-        "side": np.full(count, side, np.int32),
-        "surface": mesh.island_of_triangle[raster.triangle].astype(np.int32) + np.int32(first_surface),
-        "triangle": raster.triangle + np.int32(first_triangle),
-        "barycentric": raster.barycentric,
-        "derivative": shrunk.astype(np.float32),
-        "coverage": raster.coverage,
-    }
+    return np.asarray(derivative[raster.triangle] * raster.extent[:, None, :], np.float32)
 
 
-def _assemble(
-    parts: list[dict[str, np.ndarray]], atlas: Atlas, affine: Float32, page_start: Int32, surface_count: int
-) -> Texels:
-    empty = {
-        "page": (0,), "row": (0,), "col": (0,), "instance": (0,), "side": (0,), "surface": (0,), "triangle": (0,),
-        "barycentric": (0, 2), "derivative": (0, 2, 2), "coverage": (0,),
-    }  # fmt: skip
-    floats = ("barycentric", "derivative", "coverage")
+def _columns(
+    scene: Scene, parts: list[_Side], triangle_count: int
+) -> tuple[dict[str, NDArray[Any]], sparse.csr_matrix]:
+    """The texels of all sides one after the other, as columns of :class:`Texels`; and their shares of triangles."""
+    counts = np.array([len(p.raster.row) for p in parts], np.int64)
+    starts = np.concatenate([[0], np.cumsum(counts)])
+
+    def joined(make: Callable[[_Side], Any], shape: tuple[int, ...], kind: type) -> NDArray[Any]:
+        return np.concatenate([np.zeros((0, *shape), kind), *(np.asarray(make(p), kind) for p in parts)])
+
+    def same(make: Callable[[_Side], int]) -> Int32:
+        return np.repeat(np.array([make(p) for p in parts], np.int32), counts)
+
+    islands = [scene.meshes[scene.instances[p.instance].mesh].island_of_triangle for p in parts]
     columns = {
-        name: np.concatenate([p[name] for p in parts])
-        if parts
-        else np.zeros(shape, np.float32 if name in floats else np.int32)
-        for name, shape in empty.items()
+        "page": same(lambda p: p.page),
+        "row": joined(lambda p: p.raster.row + int(p.whole[1]), (), np.int32),
+        "col": joined(lambda p: p.raster.col + int(p.whole[0]), (), np.int32),
+        "instance": same(lambda p: p.instance),
+        "side": same(lambda p: p.side),
+        "surface": np.concatenate(
+            [np.zeros(0, np.int32), *(i[p.raster.triangle] + p.first_surface for p, i in zip(parts, islands, strict=True))]
+        ).astype(np.int32),
+        "triangle": joined(lambda p: p.raster.triangle + p.first_triangle, (), np.int32),
+        "barycentric": joined(lambda p: p.raster.barycentric, (2,), np.float32),
+        "derivative": joined(lambda p: p.derivative, (2, 2), np.float32),
+        "coverage": joined(lambda p: p.raster.coverage, (), np.float32),
     }
+    texel = [p.raster.pair_texel + int(start) for p, start in zip(parts, starts, strict=False)]
+    pairs = (
+        joined(lambda p: p.raster.pair_share, (), np.float32),
+        (
+            np.concatenate([np.zeros(0, np.int64), *texel]),
+            joined(lambda p: p.raster.pair_triangle + p.first_triangle, (), np.int32),
+        ),
+    )
+    return columns, sparse.coo_matrix(pairs, shape=(int(starts[-1]), triangle_count)).tocsr()
+
+
+def _on_pages(
+    columns: dict[str, NDArray[Any]], share: sparse.csr_matrix, atlas: Atlas, surface_count: int,
+    affine: Float32, page_start: Int32,
+) -> Texels:  # fmt: skip
+    """Texels with their index images. Where rectangles overlap (a user's own layer may), the first keeps the pixel."""
     size = atlas.resolution
     inside = (columns["row"] >= 0) & (columns["row"] < size) & (columns["col"] >= 0) & (columns["col"] < size)
-    columns = {name: column[inside] for name, column in columns.items()}
+    pixel = (columns["page"].astype(np.int64) * size + columns["row"]) * size + columns["col"]
+    _, first = np.unique(np.where(inside, pixel, -1), return_index=True)
+    keep = np.zeros(len(pixel), np.bool_)
+    keep[first] = True
+    keep &= inside
+    if not keep.all():
+        columns, share = {name: column[keep] for name, column in columns.items()}, share[keep]
     index = np.full((atlas.page_count, size, size), -1, np.int32)
-    # Where rectangles overlap (a user's own layer may), the first instance keeps the pixel.
-    order = np.arange(len(columns["row"]), dtype=np.int32)[::-1]
-    index[columns["page"][::-1], columns["row"][::-1], columns["col"][::-1]] = order
-    owner = index[columns["page"], columns["row"], columns["col"]] == np.arange(len(columns["row"]))
-    if not owner.all():
-        columns = {name: column[owner] for name, column in columns.items()}
-        index[:] = -1
-        index[columns["page"], columns["row"], columns["col"]] = np.arange(len(columns["row"]), dtype=np.int32)
-    lookup = _widened(index)
+    index[columns["page"], columns["row"], columns["col"]] = np.arange(len(columns["row"]), dtype=np.int32)
     return Texels(
         **columns,
+        share=share,
         surface_count=surface_count,
         index=index,
-        lookup=lookup.reshape(-1),
+        lookup=_widened(index).reshape(-1),
         hit_affine=affine,
         hit_page=page_start,
     )
@@ -216,17 +247,15 @@ def place_texels(texels: Texels, geometry: Geometry) -> TexelFrame:
         geometric_normal=geometric * facing,
         tangent_u=tangent_u.astype(np.float32),
         tangent_v=tangent_v.astype(np.float32),
-        area=_areas(texels, tangent_u, tangent_v, e1, e2),
+        area=np.asarray(texels.share @ triangle_areas(geometry), np.float32),
     )
 
 
-def _areas(texels: Texels, tangent_u: Float32, tangent_v: Float32, e1: Float32, e2: Float32) -> Float32:
-    """(n,) m²: the triangle's area per pixel times the share of the pixel that it covers."""
-    box = np.maximum(np.abs(np.cross(tangent_u.astype(np.float64), tangent_v)).max(axis=1), 0.0)
-    box = np.sqrt(np.einsum("ij,ij->i", *[np.cross(tangent_u.astype(np.float64), tangent_v)] * 2))
-    flat = np.abs(texels.derivative).max(axis=(1, 2)) == 0
-    own = 0.5 * np.sqrt(np.einsum("ij,ij->i", *[np.cross(e1.astype(np.float64), e2)] * 2))
-    return np.where(flat, own, box).astype(np.float32)
+def triangle_areas(geometry: Geometry) -> Float32:
+    """(t,) m², in float64 inside: a float32 cross product of micrometre triangles would vanish."""
+    corners = geometry.corners.astype(np.float64)
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    return np.asarray(0.5 * np.sqrt(np.einsum("ij,ij->i", cross, cross)), np.float32)
 
 
 def texel_colours(

@@ -160,6 +160,8 @@ class EmbreeTracer:
                 continue
             triangle[new] = part.triangle_of_primitive[found["primID"][new]]
             u[new], v[new], distance[new] = found["u"][new], found["v"][new], found["tfar"][new]
+        if not self._geometry.triangle_count:
+            return Hits(triangle, u, v, distance, np.zeros(count, np.float32))
         normals = self._geometry.normals.take(triangle, axis=0, mode="clip")
         return Hits(triangle, u, v, distance, np.einsum("ij,ij->i", normals, directions))
 
