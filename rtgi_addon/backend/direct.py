@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from .geometry import Geometry
-from .lights import is_dark, may_see, view_lamp
+from .lamp_view import may_see, view_lamp
+from .lights import is_dark
 from .parallel import CHUNK_RAYS, Workers
 from .sampling import dot, stratified_pair, unit_float32
 from .scene import Float32, Int32, Light, LightKind, Material

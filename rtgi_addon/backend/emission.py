@@ -86,7 +86,9 @@ class SkySource:
 
     def emit(self, numbers: list[Float64]) -> Emission:
         patch, across = self.odds.sample(numbers[0])
-        travel = -self.sky.directions(patch, across, numbers[1]).astype(np.float64)
+        travel = -self.sky.directions(patch, across.astype(np.float32), numbers[1].astype(np.float32)).astype(
+            np.float64
+        )
         start, area = enter_box(travel, self.bounds, numbers[2], numbers[3], numbers[4])
         share = self.sky.solid_angle[patch] * area / self.odds.pdf(patch)
         return Emission(start, travel, self.sky.radiance[patch] * share[:, None])

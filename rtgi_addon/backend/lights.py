@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Lamps: how each kind sends light out (for photons) and how a point sees it (for shadow rays).
+"""Lamps: how each kind sends light out, as Cycles' lamps do (DESIGN §4). How a point sees them: ``lamp_view``.
 
-Distributions follow Cycles' lamps (DESIGN §4): a point or spot lamp of radius r is a sphere for photons and the disk
-through its centre that faces the point for shadow rays (Blender's soft falloff); both carry the same flux. All
-functions work in local space (see ``geometry``); ``origin`` is its place in the world. Numbers are (n,) in [0, 1).
+A point or spot lamp of radius r sends photons like a Lambertian sphere. All functions work in local space (see
+``geometry``); ``origin`` is its place in the world. Numbers are (n,) in [0, 1).
 """
 
 from __future__ import annotations
@@ -12,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .sampling import dot, frames, sample_cone, sample_cosine_hemisphere, sample_disk, sample_sphere
-from .scene import AreaShape, Float32, Float64, Light, LightKind
+from .sampling import Floats, frames, sample_cone, sample_cosine_hemisphere, sample_disk, sample_sphere
+from .scene import AreaShape, Float64, Light, LightKind
 
 #: Cycles' narrowest spread of an area lamp.
 MIN_SPREAD = np.pi / 180
@@ -96,7 +95,7 @@ def emit_lamp(light: Light, numbers: list[Float64], *, origin: Float64, bounds: 
         return _emit_sun(light, place, power, numbers, bounds)
     if light.kind == LightKind.AREA:
         direction = to_axes(_area_directions(light, numbers[0], numbers[1]), place)
-        start = place.position + _area_points(light, place, numbers[2], numbers[3])
+        start = place.position + area_points(light, place, numbers[2], numbers[3])
         return Emission(start, direction, np.broadcast_to(power, start.shape))
     if light.kind == LightKind.SPOT:
         direction = to_axes(sample_spot(numbers[0], numbers[1], light.cone, light.blend), place)
@@ -113,13 +112,13 @@ def _emit_sun(light: Light, place: LampPlace, power: Float64, numbers: list[Floa
     return Emission(start, direction, power * (area * sun_strength(light.angle))[:, None])
 
 
-def facing_disk(direction: Float64, radius: float, u: Float64, v: Float64) -> Float64:
+def facing_disk(direction: Floats, radius: float, u: Floats, v: Floats) -> Floats:
     """(n, 3) offsets on the disk of ``radius`` across each direction: with all directions, a Lambertian sphere."""
     if radius <= 0:
         return np.zeros_like(direction)
     disk = sample_disk(u, v) * radius
     tangent, bitangent = frames(direction)
-    return tangent * disk[:, :1] + bitangent * disk[:, 1:]
+    return np.asarray(tangent * disk[:, :1] + bitangent * disk[:, 1:])
 
 
 def enter_box(direction: Float64, bounds: Bounds, u: Float64, v: Float64, choice: Float64) -> tuple[Float64, Float64]:
@@ -145,24 +144,22 @@ def enter_box(direction: Float64, bounds: Bounds, u: Float64, v: Float64, choice
 def projected_faces(direction: Float64, bounds: Bounds) -> Float64:
     """(n, 3) m²: the box's face across each axis, as seen along ``direction``."""
     x, y, z = bounds.high - bounds.low
-    return np.abs(direction) * np.array([y * z, z * x, x * y])
+    return np.asarray(np.abs(direction) * np.array([y * z, z * x, x * y]))
 
 
-def to_axes(local: Float64, place: LampPlace) -> Float64:
+def to_axes(local: Floats, place: LampPlace) -> Float64:
     """(n, 3) vectors about +z turned to the lamp's own axis."""
-    out: Float64 = local[:, :1] * place.x + local[:, 1:2] * place.y + local[:, 2:] * place.axis
-    return out
+    return np.asarray(local[:, :1] * place.x + local[:, 1:2] * place.y + local[:, 2:] * place.axis, np.float64)
 
 
-def _area_points(light: Light, place: LampPlace, u: Float64, v: Float64) -> Float64:
+def area_points(light: Light, place: LampPlace, u: Floats, v: Floats) -> Floats:
     """(n, 3) uniform points of the lamp about its centre."""
     if light.shape == AreaShape.ELLIPSE:
         at = sample_disk(u, v) * 0.5
     else:
         at = np.stack([u, v], axis=1) - 0.5
     at = at * np.asarray(light.size)
-    out: Float64 = at[:, :1] * place.x + at[:, 1:] * place.y
-    return out.astype(u.dtype)
+    return np.asarray(at[:, :1] * place.x + at[:, 1:] * place.y, u.dtype)
 
 
 def _area_directions(light: Light, u: Float64, v: Float64) -> Float64:
@@ -174,15 +171,14 @@ def _area_directions(light: Light, u: Float64, v: Float64) -> Float64:
 # --- profiles -----------------------------------------------------------------------------------------------------
 
 
-def spot_profile(cosine: Float64, cone: float, blend: float) -> Float64:
-    """(n,) share of the intensity at ``cosine`` to the axis: 1 inside, 0 outside the cone, Cycles' smoothstep between."""
+def spot_profile(cosine: Floats, cone: float, blend: float) -> Floats:
+    """(n,) share of the intensity at ``cosine`` to the axis: 1 inside, 0 outside, Cycles' smoothstep between."""
     edge = np.cos(cone)
     width = (1 - edge) * blend
     if width <= 0:
-        return (cosine >= edge).astype(cosine.dtype)
+        return np.asarray(cosine >= edge, cosine.dtype)
     t = np.clip((cosine - edge) / width, 0, 1)
-    out: Float64 = t * t * (3 - 2 * t)
-    return out
+    return np.asarray(t * t * (3 - 2 * t))
 
 
 def spot_solid_angle(cone: float, blend: float) -> float:
@@ -204,9 +200,9 @@ def sample_spot(u: Float64, v: Float64, cone: float, blend: float) -> Float64:
     return np.stack([sine * np.cos(angle), sine * np.sin(angle), cosine], axis=1)
 
 
-def pdf_spot(cosine: Float64, cone: float, blend: float) -> Float64:
+def pdf_spot(cosine: Floats, cone: float, blend: float) -> Floats:
     """(n,) 1/sr."""
-    return spot_profile(cosine, cone, blend) / spot_solid_angle(cone, blend)
+    return np.asarray(spot_profile(cosine, cone, blend) / spot_solid_angle(cone, blend))
 
 
 def _inverse_smoothstep_integral(y: Float64) -> Float64:
@@ -214,7 +210,7 @@ def _inverse_smoothstep_integral(y: Float64) -> Float64:
     t = np.cbrt(y) * (1 + 0.26 * y)
     for _ in range(4):
         slope = np.maximum(t * t * (3 - 2 * t), 1e-30)
-        t = np.clip(t - (t * t * t * (1 - t / 2) - y) / slope, 0, 1)
+        t = np.asarray(np.clip(t - (t * t * t * (1 - t / 2) - y) / slope, 0, 1))
     return t
 
 
@@ -222,7 +218,7 @@ def half_spread(light: Light) -> float:
     return max(light.spread, MIN_SPREAD) / 2
 
 
-def spread_profile(cosine: Float64, half: float) -> Float64:
+def spread_profile(cosine: Floats, half: float) -> Floats:
     """(n,) Cycles' soft-box: what the slats of a grid let through at ``cosine``, scaled to keep the lamp's flux."""
     scale = 1 / (np.tan(half) - half)
     tangent = np.sqrt(np.maximum(1 - cosine * cosine, 0)) / np.maximum(cosine, 1e-6)
@@ -237,100 +233,21 @@ def sample_spread(u: Float64, v: Float64, half: float) -> Float64:
     for _ in range(3):
         slope = 2 * np.sin(angle) * (limit * np.cos(angle) - np.sin(angle)) * scale
         step = (_spread_cdf(angle, limit, scale) - u) / np.maximum(slope, 1e-9)
-        angle = np.clip(angle - np.clip(step, -half / 1024, half / 1024), 0, half)
+        angle = np.asarray(np.clip(angle - np.clip(step, -half / 1024, half / 1024), 0, half))
     turn = v * (2 * np.pi)
     return np.stack([np.sin(angle) * np.cos(turn), np.sin(angle) * np.sin(turn), np.cos(angle)], axis=1)
 
 
-def pdf_spread(cosine: Float64, half: float) -> Float64:
+def pdf_spread(cosine: Floats, half: float) -> Floats:
     """(n,) 1/sr."""
-    return spread_profile(cosine, half) * np.maximum(cosine, 0) / np.pi
+    return np.asarray(spread_profile(cosine, half) * np.maximum(cosine, 0) / np.pi)
 
 
 def _spread_cdf(angle: Float64, limit: float, scale: float) -> Float64:
     sine = np.sin(angle)
-    out: Float64 = (limit * sine * sine - angle + sine * np.cos(angle)) * scale
-    return out
+    return np.asarray((limit * sine * sine - angle + sine * np.cos(angle)) * scale)
 
 
 def sun_strength(angle: float) -> float:
-    """Radiance times solid angle of a sun that gives 1 W/m² on a surface facing it: the cone's mean cosine, inverted."""
+    """Radiance times solid angle of a sun that gives 1 W/m² on a surface facing it: one over the cone's mean cosine."""
     return float(2 / (1 + np.cos(angle)))
-
-
-# --- shadow rays --------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class LampView:
-    """What n points see of a lamp: E = power · strength · cosine, on average over the numbers, where not in shadow."""
-
-    direction: Float32  # (n, 3) unit, towards the lamp
-    distance: Float32  # (n,) m
-    strength: Float32  # (n,) 1/m² (sun: 1)
-
-
-def view_lamp(
-    light: Light, points: Float32, u: Float32, v: Float32, *, origin: Float64, nearest: Float32, far: float
-) -> LampView:
-    """A point of the lamp for each of ``points`` (n, 3). ``nearest`` (n,) m bounds 1/r² where a lamp touches a wall;
-    ``far`` m is the length of a ray that leaves the scene."""
-    place = place_lamp(light, origin)
-    if light.kind == LightKind.SUN:
-        local = sample_cone(u, v, float(np.cos(light.angle)))
-        direction = -to_axes(local, place).astype(np.float32)
-        return LampView(
-            direction,
-            np.full(len(points), far, np.float32),
-            np.full(len(points), sun_strength(light.angle), np.float32),
-        )
-    centre = place.position.astype(np.float32) - points  # towards the centre
-    if light.kind == LightKind.AREA:
-        towards = centre + _area_points(light, place, u, v).astype(np.float32)
-        direction, distance, falloff = _unit(towards, nearest)
-        cosine = -(direction @ place.axis.astype(np.float32)[:, None])[:, 0]
-        strength = np.maximum(cosine, 0) * falloff / np.float32(np.pi)
-        if light.spread < FULL_SPREAD:
-            strength *= spread_profile(cosine, half_spread(light))
-        return LampView(direction, distance, strength)
-    towards, facing = centre, None
-    if light.radius > 0:
-        facing = _unit(centre, nearest)[0]
-        towards = centre + facing_disk(facing, light.radius, u, v).astype(np.float32)
-    direction, distance, falloff = _unit(towards, nearest)
-    strength = falloff / np.float32(4 * np.pi)
-    if facing is not None:
-        strength *= dot(facing, direction)
-    if light.kind == LightKind.SPOT:
-        cosine = -(direction @ place.axis.astype(np.float32)[:, None])[:, 0]
-        strength *= spot_profile(cosine, light.cone, light.blend)
-    return LampView(direction, distance, strength.astype(np.float32))
-
-
-def may_see(light: Light, points: Float32, normals: Float32, reach: Float32, *, origin: Float64) -> np.ndarray:
-    """(n,) bool: False where no point within ``reach`` (n,) m of ``points`` can get light, by facing away or being
-    outside of the lamp's cone or half space. Conservative: it never says False of a lit one."""
-    place = place_lamp(light, origin)
-    axis = place.axis.astype(np.float32)
-    if light.kind == LightKind.SUN:
-        return np.asarray((normals * -axis).sum(axis=1) > -np.sin(min(light.angle, np.pi / 2)))
-    centre = place.position.astype(np.float32) - points
-    size = light.radius if light.kind != LightKind.AREA else float(np.hypot(*light.size)) / 2
-    slack = reach + np.float32(size)
-    seen = dot(normals, centre) > -slack
-    along = -(centre * axis).sum(axis=1)  # how far before the lamp
-    if light.kind == LightKind.AREA:
-        seen &= along > -reach
-    if light.kind == LightKind.SPOT and light.cone < np.pi / 2:
-        # Distance to the cone's surface (negative inside); its tip pulled back so that it holds the whole disk.
-        across = np.sqrt(np.maximum(dot(centre, centre) - along * along, 0))
-        seen &= across * np.cos(light.cone) - along * np.sin(light.cone) <= slack
-    return np.asarray(seen)
-
-
-def _unit(towards: Float32, nearest: Float32) -> tuple[Float32, Float32, Float32]:
-    """(unit vectors, lengths, 1/length² bounded by ``nearest``)."""
-    squared = dot(towards, towards)
-    length = np.sqrt(squared)
-    direction = towards / np.maximum(length, np.float32(1e-30))[:, None]
-    return direction, length, 1 / np.maximum(squared, np.maximum(nearest * nearest, np.float32(1e-30)))

@@ -19,6 +19,8 @@ from .photons import AFTER_DIFFUSE, AFTER_SPECULAR, PhotonPaths
 from .scene import Bool, Float32, Float64, Int32
 from .texels import TexelFrame, Texels
 
+Rows = NDArray[np.int64]
+
 #: Within so many texel widths the count of texels says little about the area, and the disk is taken as it is.
 _DISK_TEXELS = 1.5
 
@@ -66,14 +68,14 @@ def photon_irradiance(photons: PhotonMap, texels: Texels, frame: TexelFrame, wor
     """
     out = np.zeros((texels.count, 3), np.float32)
     count = np.bincount(photons.surface, minlength=texels.surface_count)
-    area = np.bincount(texels.surface, frame.area, minlength=texels.surface_count)
+    area = np.bincount(texels.surface, frame.area, minlength=texels.surface_count).astype(np.float64)
     few = count <= k
     rows = np.nonzero(few[texels.surface] & (count[texels.surface] > 0))[0]
     if len(rows):
         out[rows] = _mean_irradiance(photons, area, texels.surface_count)[texels.surface[rows]]
     rows = np.nonzero(~few[texels.surface])[0]
     if len(rows):
-        out[rows] = _nearest(photons, texels, frame, workers, rows, k)
+        out[rows] = _nearest(photons, texels, frame, workers, rows, area, k)
     return out
 
 
@@ -84,7 +86,7 @@ def _mean_irradiance(photons: PhotonMap, area: Float64, surfaces: int) -> Float6
 
 
 def _nearest(
-    photons: PhotonMap, texels: Texels, frame: TexelFrame, workers: Workers, rows: NDArray[np.integer], k: int
+    photons: PhotonMap, texels: Texels, frame: TexelFrame, workers: Workers, rows: Rows, surface_area: Float64, k: int
 ) -> Float32:
     """(m, 3) for texels ``rows`` (m,), whose surfaces have more than k photons."""
     low, high = frame.position.min(axis=0), frame.position.max(axis=0)
@@ -95,23 +97,28 @@ def _nearest(
     distance, nearest = tree.query(places, k=k, workers=workers.count)
     radius = distance[:, -1]
     flux = photons.flux.astype(np.float64)[nearest[:, :-1]].sum(axis=1)
-    area = _spanned_area(texels, frame, workers, rows, radius, apart)
+    area = _spanned_area(texels, frame, workers, rows, surface_area, radius, apart)
     # All k photons in one point span nothing; the texel's own area is the least there is.
     least = np.maximum(frame.area[rows], np.finfo(np.float32).tiny)
-    return (flux / np.maximum(area, least)[:, None]).astype(np.float32)
+    return np.asarray(flux / np.maximum(area, least)[:, None], np.float32)
 
 
 def _spanned_area(
-    texels: Texels, frame: TexelFrame, workers: Workers, rows: NDArray[np.integer], radius: Float64, apart: float
+    texels: Texels,
+    frame: TexelFrame,
+    workers: Workers,
+    rows: Rows,
+    surface_area: Float64,
+    radius: Float64,
+    apart: float,
 ) -> Float64:
     """(m,) m²: the part of the disk of ``radius`` that lies on the surface, for texels near its border less than all.
 
     Counted in texels of the surface; where that says little (small disks) or more than the disk has, the disk is taken.
     """
     disk = np.pi * radius * radius
-    mean = np.bincount(texels.surface, frame.area, texels.surface_count)
-    mean /= np.maximum(np.bincount(texels.surface, minlength=texels.surface_count), 1)
-    texel = mean[texels.surface[rows]]
+    number = np.maximum(np.bincount(texels.surface, minlength=texels.surface_count), 1)
+    texel = (surface_area / number)[texels.surface[rows]]
     wide = np.nonzero(radius > _DISK_TEXELS * np.sqrt(texel))[0]
     if not len(wide):
         return disk

@@ -19,7 +19,7 @@ from .emission import Int64, PhotonSource
 from .parallel import Workers
 from .progress import Report, silent
 from .sampling import photon_numbers, unit_float32, unit_float64
-from .scatter import ABSORBED, Surfaces, scatter
+from .scatter import ABSORBED, Surfaces, scatter, take_hits
 from .scene import Float32, Float64, Int32
 from .tracing import Hits, Tracer
 
@@ -36,7 +36,7 @@ _FLAG_OF_KIND = np.array([AFTER_DIFFUSE, AFTER_SPECULAR, AFTER_SPECULAR, 0, 0], 
 END_ABSORBED, END_ESCAPED, END_CUT = np.uint8(0), np.uint8(1), np.uint8(2)
 
 #: Photons traced together: smaller than other chunks, since ten arrays of them must stay in cache (measured).
-CHUNK_PHOTONS = 1 << 14
+CHUNK_PHOTONS = 1 << 15
 _CHUNKS_PER_REPORT = 64
 
 
@@ -88,11 +88,9 @@ class EnergyBook:
     @staticmethod
     def total(books: Sequence[EnergyBook]) -> EnergyBook:
         """The sum, in order."""
-        zero = np.zeros(3)
-        return EnergyBook(
-            *[sum((getattr(b, f.name) for b in books), zero) for f in fields(EnergyBook) if f.name != "rays"],
-            rays=sum(b.rays for b in books),
-        )
+        columns = ([getattr(b, f.name) for b in books] for f in fields(EnergyBook) if f.name != "rays")
+        emitted, absorbed, unlit, escaped, cut = (np.array(c).reshape(-1, 3).sum(axis=0) for c in columns)
+        return EnergyBook(emitted, absorbed, unlit, escaped, cut, sum(b.rays for b in books))
 
 
 def trace_photons(
@@ -149,7 +147,7 @@ def join_paths(parts: Sequence[PhotonPaths]) -> PhotonPaths:
     return PhotonPaths(first_hit=np.concatenate(first).astype(np.int64), **others)
 
 
-def take_paths(paths: PhotonPaths, keep: NDArray[np.integer]) -> PhotonPaths:
+def take_paths(paths: PhotonPaths, keep: NDArray[np.integer[Any]]) -> PhotonPaths:
     """The paths ``keep`` (k,) of ``paths``, in that order."""
     length = np.diff(paths.first_hit)[keep]
     first = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
@@ -175,7 +173,7 @@ class _Flight:
     flux: Float32  # (k, 3)
     flags: UInt8  # (k,)
 
-    def keep(self, rows: NDArray[np.integer]) -> None:
+    def keep(self, rows: NDArray[np.integer[Any]]) -> None:
         """Only ``rows`` fly on."""
         for f in fields(self):
             setattr(self, f.name, getattr(self, f.name).take(rows, axis=0))
@@ -231,7 +229,7 @@ def _trace(
     rays = 0
     flight.keep(np.nonzero(flight.flux.max(axis=1, initial=0) > 0)[0])
 
-    def finish(rows: NDArray[np.integer], how: np.uint8) -> None:
+    def finish(rows: NDArray[np.integer[Any]], how: np.uint8) -> None:
         path = flight.path[rows]
         end[path], end_direction[path], end_flux[path] = how, flight.direction[rows], flight.flux[rows]
 
@@ -244,7 +242,7 @@ def _trace(
         landed = np.nonzero(hits.triangle >= 0)[0]
         if len(landed) < len(flight.path):
             flight.keep(landed)
-            hits = _take_hits(hits, landed)
+            hits = take_hits(hits, landed)
         landing = _land(flight, hits, surfaces)
         landings.append(landing)
         numbers = [unit_float32(n) for n in photon_numbers(flight.light, flight.index, bounce, seed=seed)]
@@ -261,12 +259,6 @@ def _trace(
     escaped, cut = (end_flux[end == how].sum(axis=0, dtype=np.float64) for how in (END_ESCAPED, END_CUT))
     paths = _gather_paths(landings, light, index, origin, (end, end_direction, end_flux))
     return paths, EnergyBook(emitted, absorbed, unlit, escaped, cut, rays)
-
-
-def _take_hits(hits: Hits, rows: NDArray[np.integer]) -> Hits:
-    return Hits(
-        hits.triangle.take(rows), hits.u.take(rows), hits.v.take(rows), hits.distance.take(rows), hits.back.take(rows)
-    )
 
 
 def _land(flight: _Flight, hits: Hits, surfaces: Surfaces) -> _Landing:
@@ -292,7 +284,7 @@ def _gather_paths(
     total = int(first[-1])
 
     def column(name: str, shape: tuple[int, ...], dtype: type) -> NDArray[Any]:
-        out = np.zeros(shape, dtype)
+        out: NDArray[Any] = np.zeros(shape, dtype)
         for bounce, landing in enumerate(landings):
             out[first[landing.path] + bounce] = getattr(landing, name)
         return out

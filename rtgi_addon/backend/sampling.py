@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from numpy.typing import NDArray
 from .scene import Float32, Float64, Int32
 
 UInt32 = NDArray[np.uint32]
+#: Either precision: the result has that of the numbers given.
+Floats = NDArray[np.floating[Any]]
 
 #: Halton bases. Beyond them numbers are hashed: Halton's high bases are no better than chance at usual counts.
 PRIMES = (2, 3, 5, 7, 11, 13, 17, 19, 23, 29, 31, 37, 41, 43, 47, 53, 59)
@@ -34,10 +37,10 @@ def hash_uint32(value: UInt32) -> UInt32:
     """(n,) well mixed bits of (n,) integers: the PCG output hash (Jarzynski and Olano 2020, "pcg")."""
     state = value * np.uint32(747796405) + np.uint32(2891336453)
     word = ((state >> ((state >> np.uint32(28)) + np.uint32(4))) ^ state) * np.uint32(277803737)
-    return (word >> np.uint32(22)) ^ word
+    return np.asarray((word >> np.uint32(22)) ^ word)
 
 
-def hash_keys(first: NDArray[np.integer], *keys: int | NDArray[np.integer]) -> UInt32:
+def hash_keys(first: NDArray[np.integer[Any]], *keys: int | NDArray[np.integer[Any]]) -> UInt32:
     """(n,) bits of several keys, arrays (n,) or numbers; the order of the keys matters."""
     bits = hash_uint32(np.atleast_1d(first).astype(np.uint32))
     for key in keys:
@@ -52,7 +55,7 @@ def unit_float32(bits: UInt32) -> Float32:
 
 def unit_float64(bits: UInt32) -> Float64:
     """[0, 1) from all 32 bits."""
-    return bits * 2.0**-32
+    return np.asarray(bits * 2.0**-32)
 
 
 @lru_cache(maxsize=256)
@@ -152,14 +155,13 @@ def stratified_pair(key: UInt32, count: int, *, pair: int, seed: int = 0) -> tup
 # --- vectors ------------------------------------------------------------------------------------------------------
 
 
-def dot(a: Float32, b: Float32) -> Float32:
+def dot(a: Floats, b: Floats) -> Floats:
     """(n,) of (n, 3) and (n, 3), summed in one fixed order."""
     product = a * b
-    total: Float32 = product[:, 0] + product[:, 1] + product[:, 2]
-    return total
+    return np.asarray(product[:, 0] + product[:, 1] + product[:, 2])
 
 
-def frames(normals: Float32) -> tuple[Float32, Float32]:
+def frames(normals: Floats) -> tuple[Floats, Floats]:
     """((n, 3), (n, 3)) two tangents that complete each unit normal to a right-handed frame (Duff et al. 2017)."""
     x, y, z = normals[:, 0], normals[:, 1], normals[:, 2]
     sign = np.copysign(np.ones_like(z), z)
@@ -170,16 +172,16 @@ def frames(normals: Float32) -> tuple[Float32, Float32]:
     return tangent, bitangent
 
 
-def to_frame(local: Float32, normals: Float32) -> Float32:
+def to_frame(local: Floats, normals: Floats) -> Floats:
     """(n, 3) vectors given in the frames of ``normals`` (z along the normal), in the space of the normals."""
     tangent, bitangent = frames(normals)
-    return tangent * local[:, :1] + bitangent * local[:, 1:2] + normals * local[:, 2:]
+    return np.asarray(tangent * local[:, :1] + bitangent * local[:, 1:2] + normals * local[:, 2:])
 
 
 # --- densities: u, v are (n,) in [0, 1) ------------------------------------------------------------------------------
 
 
-def sample_disk(u: Float32, v: Float32) -> Float32:
+def sample_disk(u: Floats, v: Floats) -> Floats:
     """(n, 2) uniform on the unit disk."""
     radius = np.sqrt(u)
     angle = v * u.dtype.type(2 * np.pi)
@@ -190,7 +192,7 @@ def pdf_disk() -> float:
     return 1 / np.pi
 
 
-def sample_sphere(u: Float32, v: Float32) -> Float32:
+def sample_sphere(u: Floats, v: Floats) -> Floats:
     """(n, 3) uniform unit vectors."""
     one, two = u.dtype.type(1), u.dtype.type(2)
     z = one - two * u
@@ -207,18 +209,18 @@ def pdf_sphere() -> float:
     return 1 / (4 * np.pi)
 
 
-def sample_cosine_hemisphere(u: Float32, v: Float32) -> Float32:
+def sample_cosine_hemisphere(u: Floats, v: Floats) -> Floats:
     """(n, 3) unit vectors about +z, density proportional to the cosine."""
     disk = sample_disk(u, v)
     return np.concatenate([disk, np.sqrt(np.maximum(1 - u, 0))[:, None]], axis=1)
 
 
-def pdf_cosine_hemisphere(cosine: Float32) -> Float32:
+def pdf_cosine_hemisphere(cosine: Floats) -> Floats:
     """(n,) 1/sr of directions at ``cosine`` to the normal."""
-    return np.maximum(cosine, 0) / np.pi
+    return np.asarray(np.maximum(cosine, 0) / np.pi)
 
 
-def sample_cosine_about(normals: Float32, u: Float32, v: Float32) -> Float32:
+def sample_cosine_about(normals: Floats, u: Floats, v: Floats) -> Floats:
     """(n, 3) cosine-distributed unit vectors about ``normals``: normal plus a point of the unit sphere.
 
     Half the work of a frame. Density as :func:`pdf_cosine_hemisphere`.
@@ -234,7 +236,7 @@ def sample_cosine_about(normals: Float32, u: Float32, v: Float32) -> Float32:
     return out
 
 
-def sample_cone(u: Float32, v: Float32, cos_half: float | Float32) -> Float32:
+def sample_cone(u: Floats, v: Floats, cos_half: float | Floats) -> Floats:
     """(n, 3) uniform unit vectors within the cone about +z; ``cos_half`` is the cosine of half its angle."""
     z = 1 - u * (1 - cos_half)
     radius = np.sqrt(np.maximum(u * (1 - cos_half) * (1 + z), 0))  # sqrt(1 - z²) without cancellation
@@ -242,20 +244,20 @@ def sample_cone(u: Float32, v: Float32, cos_half: float | Float32) -> Float32:
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), z], axis=1)
 
 
-def pdf_cone(cos_half: float | Float32) -> float | Float32:
+def pdf_cone(cos_half: float) -> float:
     """1/sr within the cone."""
     return 1 / (2 * np.pi * (1 - cos_half))
 
 
-def sample_triangle(u: Float32, v: Float32) -> tuple[Float32, Float32]:
+def sample_triangle(u: Floats, v: Floats) -> tuple[Floats, Floats]:
     """((n,), (n,)) uniform barycentric weights of the second and third corner."""
     root = np.sqrt(u)
     return root * (1 - v), root * v
 
 
-def pdf_triangle(area: Float32) -> Float32:
+def pdf_triangle(area: Floats) -> Floats:
     """1/m² on a triangle of ``area``."""
-    return 1 / area
+    return np.asarray(1 / area)
 
 
 @dataclass(frozen=True)
@@ -265,7 +267,7 @@ class Discrete:
     cdf: Float64  # (m + 1,) from 0 to 1
     total: float  # sum of the weights it was made from
 
-    def sample(self, u: Float64) -> tuple[Int32, Float64]:
+    def sample(self, u: Floats) -> tuple[Int32, Float64]:
         """((n,), (n,)) element drawn by ``u``, and what is left of ``u``, uniform again in [0, 1)."""
         index = np.searchsorted(self.cdf, u, side="right").astype(np.int32) - np.int32(1)
         low, high = self.cdf[index], self.cdf[index + 1]
@@ -277,7 +279,7 @@ class Discrete:
         return out
 
 
-def make_discrete(weights: NDArray[np.floating]) -> Discrete:
+def make_discrete(weights: Floats) -> Discrete:
     """Odds in proportion to ``weights`` (m,) >= 0. Raises ValueError where none is positive."""
     cumulative = np.cumsum(weights, dtype=np.float64)
     if len(cumulative) == 0 or not cumulative[-1] > 0:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .geometry import Geometry
-from .sampling import dot, sample_cosine_about
+from .sampling import Floats, dot, sample_cosine_about
 from .scene import Bool, Float32, Int32, Material
 from .texels import Texels
 from .tracing import Hits
@@ -53,7 +54,7 @@ class Scattered:
 
 
 def make_surfaces(geometry: Geometry, texels: Texels, albedo: Float32, materials: Sequence[Material]) -> Surfaces:
-    """``albedo`` (n, 3) as ``texels.texel_colours`` gives it. Shares outside [0, 1] are cut to it: energy is bounded."""
+    """``albedo`` (n, 3) as ``texels.texel_colours`` gives it. Shares are cut to [0, 1], so energy is bounded."""
 
     def shares(rows: list[tuple[float, float, float]]) -> Float32:
         return np.clip(np.array(rows, np.float32).reshape(-1, 3), 0, 1)
@@ -100,7 +101,7 @@ def scatter(
     kind[kind == 1] = ABSORBED
     out = np.zeros_like(direction)
     if len(special):
-        sub = Hits(*(column[special] for column in (hits.triangle, hits.u, hits.v, hits.distance, hits.back)))
+        sub = take_hits(hits, special)
         shares, turned = _special_lobes(surfaces, sub, normal[special], direction[special], reflected[special])
         kind[special], after[special] = choose(shares, flux[special], numbers[2][special])
         for lobe, vectors in turned.items():
@@ -110,6 +111,11 @@ def scatter(
     out[rows] = sample_cosine_about(normal[rows], numbers[0][rows], numbers[1][rows])
     lift = surfaces.offset_length(position) * np.where(dot(out, normal) < 0, np.float32(-1), np.float32(1))
     return Scattered(kind, position + normal * lift[:, None], out, after)
+
+
+def take_hits(hits: Hits, rows: NDArray[np.integer[Any]]) -> Hits:
+    """Some of ``hits``."""
+    return Hits(hits.triangle[rows], hits.u[rows], hits.v[rows], hits.distance[rows], hits.back[rows])
 
 
 def choose(shares: Sequence[Float32], flux: Float32, number: Float32) -> tuple[NDArray[np.uint8], Float32]:
@@ -176,8 +182,8 @@ def shading_normals(surfaces: Surfaces, hits: Hits, normal: Float32, direction: 
 
 def reflect(direction: Float32, shading: Float32, normal: Float32) -> Float32:
     """(n, 3) mirror directions about ``shading``; about ``normal`` where that would go through the surface."""
-    out = direction - shading * (2 * dot(direction, shading))[:, None]
-    plain = direction - normal * (2 * dot(direction, normal))[:, None]
+    out = np.asarray(direction - shading * (2 * dot(direction, shading))[:, None], np.float32)
+    plain = np.asarray(direction - normal * (2 * dot(direction, normal))[:, None], np.float32)
     return np.where((dot(out, normal) > 0)[:, None], out, plain)
 
 
@@ -193,7 +199,7 @@ def refract(direction: Float32, shading: Float32, ratio: Float32) -> tuple[Float
     parallel = (cosine - ratio * beyond) / (cosine + ratio * beyond + np.float32(1e-12))
     perpendicular = (ratio * cosine - beyond) / (ratio * cosine + beyond + np.float32(1e-12))
     fresnel = np.where(total, np.float32(1), (parallel * parallel + perpendicular * perpendicular) / 2)
-    out = direction * ratio[:, None] + shading * (ratio * cosine - beyond)[:, None]
+    out = np.asarray(direction * ratio[:, None] + shading * (ratio * cosine - beyond)[:, None], np.float32)
     out /= np.sqrt(np.maximum(dot(out, out), np.float32(1e-20)))[:, None]
     return out, fresnel.astype(np.float32)
 

@@ -112,7 +112,8 @@ class Light:
     kind: LightKind
     matrix_world: Float64  # (4, 4), scale is ignored but for AREA, whose sizes below already hold it
     power: tuple[float, float, float]
-    radius: float = 0.0  # POINT, SPOT: m; a sphere light's
+    radius: float = 0.0  # POINT, SPOT: m
+    soft_falloff: bool = True  # POINT, SPOT with a radius: seen as a disk that faces the point, else as a sphere
     angle: float = 0.0  # SUN: half the apparent angle, rad
     cone: float = np.pi / 4  # SPOT: half the cone's angle, rad
     blend: float = 0.0  # SPOT: Blender's spot_blend, 0 hard, 1 smooth
