@@ -20,6 +20,8 @@ SUBSAMPLES = 4
 CHUNK_PAIRS = 1 << 20
 #: A pixel that a triangle enters by less than this is not touched: rectangle borders meet the pixel grid by rounding.
 TOUCH_PX = 2e-3
+#: From this area in pixels on, counted sub-samples give a triangle's area well enough.
+LARGE_PX = 4.0
 #: A triangle whose pixel-space area is below this has no direction in the map.
 FLAT_AREA_PX = 1e-9
 
@@ -36,7 +38,7 @@ class RasterTexels:
     extent: Float32  # (n, 2) size of the covered part along col and row, pixels
     pair_texel: Int32  # (m,) texel and triangle of each overlap,
     pair_triangle: Int32  # (m,)
-    pair_share: Float32  # (m,) and how much of the triangle's area lies there; sums to one over a triangle
+    pair_share: Float32  # (m,) and how much of the triangle's area lies there; sums to about one over a triangle
 
 
 def rasterise(corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
@@ -217,9 +219,12 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
     # The middle of the covered part may lie on a neighbour; the nearest point of the chosen triangle stands for it.
     point = _nearest_points(point, corners[:, 0], corners[:, 1], corners[:, 2])
     smallest = 1.0 / (SUBSAMPLES * SUBSAMPLES)
-    # A triangle between the sub-samples still has its area: it counts as a sliver of one.
-    part = np.maximum(pairs.samples[member], smallest)
-    of_triangle = np.bincount(pairs.triangle[member], weights=part)
+    # A triangle between the sub-samples still has its area: it counts as a sliver of one. Small triangles' shares are
+    # made to sum to one; large ones are left as counted, so that both sides of a shared edge fit together.
+    part = np.maximum(pairs.samples[member] * smallest, smallest * smallest)
+    counted = np.bincount(pairs.triangle[member], weights=part, minlength=len(corner_px))
+    exact = _pixel_areas(corner_px)
+    of_triangle = np.where(exact >= LARGE_PX, exact, counted)
     return RasterTexels(
         row=pairs.row[chosen],
         col=pairs.col[chosen],
@@ -231,6 +236,11 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
         pair_triangle=pairs.triangle[member],
         pair_share=(part / of_triangle[pairs.triangle[member]]).astype(np.float32),
     )
+
+
+def _pixel_areas(corner_px: Float64) -> Float64:
+    e1, e2 = corner_px[:, 1] - corner_px[:, 0], corner_px[:, 2] - corner_px[:, 0]
+    return np.asarray(np.abs(e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]) / 2)
 
 
 def _barycentric(point: Float64, corners: Float64) -> Float64:
