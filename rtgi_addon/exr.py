@@ -17,6 +17,7 @@ import numpy as np
 
 from .backend.errors import BakeError
 from .backend.scene import Bool, Float32
+from .output import whole_file
 
 
 def write_page(path: str | os.PathLike[str], rgb: Float32, valid: Bool) -> None:
@@ -33,16 +34,12 @@ def write_page(path: str | os.PathLike[str], rgb: Float32, valid: Bool) -> None:
     pixels[..., 3] = valid
     if not path.parent.is_dir():  # Blender would make it, and then hide why the file cannot be written
         raise BakeError(f"{path}: its folder does not exist; make it or choose another output folder")
-    aside = path.with_name(f".{path.name}.part")
     try:
-        with _pixel_image(pixels) as image, _exr_scene() as scene:
-            image.save_render(str(aside), scene=scene)
-        os.replace(aside, path)
+        with whole_file(path) as part, _pixel_image(pixels) as image, _exr_scene() as scene:
+            image.save_render(str(part), scene=scene)
     except (OSError, RuntimeError) as error:
         reason = str(error).strip().splitlines()[0].removeprefix("Error: ")
         raise BakeError(f"{path}: cannot be written ({reason}); check free space and permissions") from error
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def read_page(path: str | os.PathLike[str]) -> tuple[Float32, Bool]:

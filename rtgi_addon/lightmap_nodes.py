@@ -1,0 +1,306 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The shared node group "RTGI Light" and how it gets into a node tree and out of it again.
+
+The group samples the light maps where the shaded point lies in the atlas and emits albedo × E / π (E in W/m²), the
+radiance a diffuse surface sends back. Each diffuse closure of a material gets one group node, added right behind it,
+so that the material's own mixing weighs the light as it weighs the closure. All nodes of ours carry the custom
+property ``rtgi``: removal needs no other record and works on a file saved long ago.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import bpy
+
+from .output import map_name
+
+GROUP_NAME = "RTGI Light"
+UV_LAYER = "RTGI"
+MARK = "rtgi"
+FRAMES = "rtgi_frames"  # on the group: first and last frame of its maps
+
+#: Object properties the group reads, (front, back); each is three floats: ``*_scale`` holds scale u, scale v and
+#: page + 1 (0: no map on this side, which is also what an object without the property gives), ``*_offset`` u, v, 0.
+SCALE_PROPERTIES = ("rtgi_front_scale", "rtgi_back_scale")
+OFFSET_PROPERTIES = ("rtgi_front_offset", "rtgi_back_offset")
+
+_LAST_FRAME = 1_048_574  # Blender's MAXFRAME
+
+#: Diffuse closures: which of the closure's inputs feed which of the group's.
+_GROUP_INPUTS_OF_CLOSURE = {
+    "ShaderNodeBsdfPrincipled": {
+        "Base Color": "Albedo",
+        "Metallic": "Metallic",
+        "Transmission Weight": "Transmission",
+        "Alpha": "Alpha",
+    },
+    "ShaderNodeBsdfDiffuse": {"Color": "Albedo"},
+    "ShaderNodeBsdfToon": {"Color": "Albedo"},
+    "ShaderNodeSubsurfaceScattering": {"Color": "Albedo"},
+    "ShaderNodeEeveeSpecular": {"Base Color": "Albedo", "Transparency": "Transmission"},
+}
+#: Closures that scatter widely but have no albedo socket to read.
+_UNREAD_CLOSURES = ("ShaderNodeBsdfTranslucent", "ShaderNodeBsdfSheen", "ShaderNodeBsdfHairPrincipled")
+
+
+@dataclass(frozen=True)
+class MapFiles:
+    """The light maps of a bake on disk: ``folder/<kind>.p<page>.<frame>.exr``."""
+
+    folder: Path
+    kinds: tuple[str, ...]  # "iim", "caustics"
+    page_count: int
+    frames: tuple[int, ...]  # ascending, evenly spaced
+
+    def path(self, kind: str, page: int, frame: int) -> Path:
+        return self.folder / map_name(kind, page, frame)
+
+
+def make_group(maps: MapFiles) -> bpy.types.ShaderNodeTree:
+    """The node group over ``maps``, in place of an older one of ours."""
+    remove_group()
+    tree = bpy.data.node_groups.new(GROUP_NAME, "ShaderNodeTree")
+    tree[MARK] = True
+    tree[FRAMES] = (maps.frames[0], maps.frames[-1])
+    tree.interface.new_socket("Light", in_out="OUTPUT", socket_type="NodeSocketShader")
+    tree.interface.new_socket("Albedo", in_out="INPUT", socket_type="NodeSocketColor")
+    for name, default in (("Metallic", 0.0), ("Transmission", 0.0), ("Alpha", 1.0)):
+        socket = tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
+        socket.default_value, socket.min_value, socket.max_value = default, 0.0, 1.0
+    wiring = _Wiring(tree)
+    uv, page = _place_in_atlas(wiring)
+    irradiance = _sample_pages(wiring, maps, uv, page)
+    _emit(wiring, irradiance)
+    return tree
+
+
+def remove_group() -> None:
+    """Remove the group and the images that only it shows."""
+    for tree in [t for t in bpy.data.node_groups if t.get(MARK) and t.bl_idname == "ShaderNodeTree"]:
+        bpy.data.node_groups.remove(tree)
+    for image in [i for i in bpy.data.images if i.get(MARK)]:
+        bpy.data.images.remove(image)
+
+
+def light_tree(tree: bpy.types.NodeTree, group: bpy.types.ShaderNodeTree) -> list[str]:
+    """Add ``group`` behind each diffuse closure of ``tree``; the names of closures that had to be left dark.
+
+    A tree that is lit already stays as it is.
+    """
+    if any(node.get(MARK) for node in tree.nodes):
+        return []
+    active, dark = tree.nodes.active, []
+    for closure in list(tree.nodes):
+        if closure.mute or not _targets(closure):
+            continue
+        if closure.bl_idname in _GROUP_INPUTS_OF_CLOSURE:
+            _light_closure(tree, closure, group)
+        elif closure.bl_idname in _UNREAD_CLOSURES:
+            dark.append(closure.bl_label)
+    tree.nodes.active = active
+    return dark
+
+
+def unlight_tree(tree: bpy.types.NodeTree) -> None:
+    """Take out what :func:`light_tree` added; every link goes back to where it was."""
+    for add in [n for n in tree.nodes if n.get(MARK) and n.bl_idname == "ShaderNodeAddShader"]:
+        closure = next((link.from_socket for link in add.inputs[0].links), None)
+        if closure is not None:  # the user may have deleted it since
+            for socket in _targets(add):
+                tree.links.new(closure, socket)
+    for node in [n for n in tree.nodes if n.get(MARK)]:
+        for socket in node.inputs:
+            if hasattr(socket, "default_value"):
+                socket.driver_remove("default_value")
+        tree.nodes.remove(node)
+
+
+def nested_trees(tree: bpy.types.NodeTree) -> Iterator[bpy.types.ShaderNodeGroup]:
+    """The group nodes of ``tree`` itself whose groups hold shaders."""
+    for node in tree.nodes:
+        if node.bl_idname == "ShaderNodeGroup" and node.node_tree and not node.node_tree.get(MARK) and not node.mute:
+            if any(socket.type == "SHADER" for socket in node.outputs):
+                yield node
+
+
+def _targets(node: bpy.types.Node) -> list[bpy.types.NodeSocket]:
+    links = node.outputs[0].links if node.outputs else ()
+    return [link.to_socket for link in links if not link.is_muted]
+
+
+def _light_closure(tree: bpy.types.NodeTree, closure: bpy.types.Node, group: bpy.types.ShaderNodeTree) -> None:
+    targets = _targets(closure)
+    add, lit = tree.nodes.new("ShaderNodeAddShader"), tree.nodes.new("ShaderNodeGroup")
+    lit.node_tree = group
+    for node, shift in ((lit, (0.0, 180.0)), (add, (190.0, 90.0))):
+        node[MARK] = True
+        node.select = False
+        node.label = GROUP_NAME
+        node.parent = closure.parent
+        node.location = (closure.location.x + closure.width + 40 + shift[0], closure.location.y + shift[1])
+    for source, target in _GROUP_INPUTS_OF_CLOSURE[closure.bl_idname].items():
+        _follow(tree, group[FRAMES], closure.inputs[source], lit.inputs[target])
+    tree.links.new(closure.outputs[0], add.inputs[0])
+    tree.links.new(lit.outputs[0], add.inputs[1])
+    for socket in targets:
+        tree.links.new(add.outputs[0], socket)
+
+
+def _follow(
+    tree: bpy.types.NodeTree, frames: Sequence[int], source: bpy.types.NodeSocket, target: bpy.types.NodeSocket
+) -> None:
+    """Make input ``target`` always have the value of input ``source``: its link, its constant or its animation."""
+    link = next((link for link in source.links if not link.is_muted), None)
+    if link is not None:
+        tree.links.new(link.from_socket, target)
+        return
+    target.default_value = source.default_value
+    path, animation = source.path_from_id("default_value"), tree.animation_data
+    if animation is None:
+        return
+    for curve in [c for c in animation.drivers if c.data_path == path]:
+        copy = animation.drivers.from_existing(src_driver=curve)
+        copy.data_path = target.path_from_id("default_value")
+    for curve in [c for c in _curves(animation) if c.data_path == path]:
+        _copy_curve(curve, target, frames)
+
+
+def _copy_curve(curve: bpy.types.FCurve, target: bpy.types.NodeSocket, frames: Sequence[int]) -> None:
+    """Give ``target`` the values of ``curve`` over its keys and over ``frames`` (first, last).
+
+    As a driver, a curve over "frame", so that the user's action stays as it is. A driver that read the other socket
+    would make Blender see a loop, both being of one tree.
+    """
+    is_vector = hasattr(target.default_value, "__len__")
+    copy = target.driver_add("default_value", curve.array_index) if is_vector else target.driver_add("default_value")
+    copy.driver.type, copy.driver.expression = "SCRIPTED", "frame"  # too simple to need script rights
+    for modifier in list(copy.modifiers):
+        copy.modifiers.remove(modifier)
+    copy.keyframe_points.clear()
+    first, last = curve.range()
+    for frame in range(min(frames[0], math.floor(first)), max(frames[1], math.ceil(last)) + 1):
+        copy.keyframe_points.insert(frame, curve.evaluate(frame)).interpolation = "LINEAR"
+    copy.extrapolation = "CONSTANT"
+
+
+def _curves(animation: bpy.types.AnimData) -> list[bpy.types.FCurve]:
+    """The F-curves of the action in use, whether it has slots (4.4 and later) or not."""
+    action = animation.action
+    if action is None:
+        return []
+    if not hasattr(action, "layers"):
+        return list(action.fcurves)
+    slot = animation.action_slot
+    bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips] if slot else []
+    return [curve for bag in bags if bag is not None for curve in bag.fcurves]
+
+
+class _Wiring:
+    """Nodes added to one tree, left to right, by what they compute; inputs are sockets or constants."""
+
+    def __init__(self, tree: bpy.types.ShaderNodeTree) -> None:
+        self.tree = tree
+        self._column = 0
+
+    def node(self, kind: str, *inputs: object, **attributes: object) -> bpy.types.Node:
+        node = self.tree.nodes.new(kind)
+        node.location = (180.0 * (self._column // 4), -170.0 * (self._column % 4))
+        self._column += 1
+        for name, value in attributes.items():
+            setattr(node, name, value)
+        for socket, value in zip(node.inputs, inputs, strict=False):
+            if isinstance(value, bpy.types.NodeSocket):
+                self.tree.links.new(value, socket)
+            elif value is not None:
+                socket.default_value = value
+        return node
+
+    def math(self, operation: str, *inputs: object, clamp: bool = False) -> bpy.types.NodeSocket:
+        return self.node("ShaderNodeMath", *inputs, operation=operation, use_clamp=clamp).outputs[0]
+
+    def vector(self, operation: str, *inputs: object) -> bpy.types.NodeSocket:
+        return self.node("ShaderNodeVectorMath", *inputs, operation=operation).outputs[0]
+
+    def scaled(self, vector: bpy.types.NodeSocket, factor: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
+        node = self.node("ShaderNodeVectorMath", vector, operation="SCALE")
+        self.tree.links.new(factor, node.inputs["Scale"])
+        return node.outputs[0]
+
+
+def _place_in_atlas(wiring: _Wiring) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
+    """Page UV and page + 1 of the shaded point, on the side that faces the viewer.
+
+    Blender's "backfacing" follows the object's own front, mirrored or not, as ``Atlas`` does.
+    """
+    back = wiring.node("ShaderNodeNewGeometry").outputs["Backfacing"]
+    sides = []
+    for names in (SCALE_PROPERTIES, OFFSET_PROPERTIES):
+        front, behind = (
+            wiring.node("ShaderNodeAttribute", attribute_type="OBJECT", attribute_name=name).outputs["Vector"]
+            for name in names
+        )
+        difference = wiring.vector("SUBTRACT", behind, front)
+        sides.append(wiring.vector("ADD", front, wiring.scaled(difference, back)))
+    scale, offset = sides
+    uv = wiring.node("ShaderNodeUVMap", uv_map=UV_LAYER).outputs["UV"]
+    page = wiring.node("ShaderNodeSeparateXYZ", scale).outputs["Z"]
+    return wiring.vector("MULTIPLY_ADD", uv, scale, offset), page
+
+
+def _sample_pages(
+    wiring: _Wiring, maps: MapFiles, uv: bpy.types.NodeSocket, page: bpy.types.NodeSocket
+) -> bpy.types.NodeSocket:
+    """Sum over kinds of the irradiance on the point's own page; black without a page."""
+    total = None
+    for index in range(maps.page_count):
+        light = None
+        for kind in maps.kinds:
+            texture = wiring.node("ShaderNodeTexImage", uv, extension="EXTEND", interpolation="Linear")
+            _show(texture, maps, kind, index)
+            color = texture.outputs["Color"]
+            light = color if light is None else wiring.vector("ADD", light, color)
+        masked = wiring.scaled(light, wiring.math("COMPARE", page, index + 1.0, 0.5))
+        total = masked if total is None else wiring.vector("ADD", total, masked)
+    return total
+
+
+def _show(texture: bpy.types.ShaderNodeTexImage, maps: MapFiles, kind: str, page: int) -> None:
+    """Let an image texture show one map, following the scene's frame; ends hold outside the baked range."""
+    first, last = maps.frames[0], maps.frames[-1]
+    path = str(maps.path(kind, page, first))
+    image = bpy.data.images.load(path, check_existing=False)
+    image[MARK] = True
+    image.name = f"rtgi_{kind}.p{page}"
+    image.colorspace_settings.name = "Non-Color"
+    image.alpha_mode = "CHANNEL_PACKED"
+    image.use_half_precision = False  # half floats end at 65504 (Blender 4 clamps there all the same)
+    if bpy.data.filepath and Path(path).anchor == Path(bpy.data.filepath).anchor:
+        image.filepath = bpy.path.relpath(path)
+    texture.image = image
+    if len(maps.frames) == 1:
+        return
+    image.source = "SEQUENCE"
+    user = texture.image_user
+    user.use_auto_refresh, user.use_cyclic = True, False
+    # Blender shows file number (frame - frame_start + 1, clamped to 0 .. frame_duration) + frame_offset: the offset
+    # makes it the last baked frame at or before the scene's. The expression is too simple to need script rights.
+    user.frame_start, user.frame_duration = 1, _LAST_FRAME
+    step = maps.frames[1] - first
+    held = f"min(max(frame, {first}), {last})"
+    if step > 1:
+        held = f"{held} - fmod({held} - {first}, {step})"
+    user.driver_add("frame_offset").driver.expression = f"{held} - max(frame, 0)"
+
+
+def _emit(wiring: _Wiring, irradiance: bpy.types.NodeSocket) -> None:
+    inputs = wiring.node("NodeGroupInput").outputs
+    diffuse = wiring.math("SUBTRACT", 1.0, inputs["Metallic"], clamp=True)
+    opaque = wiring.math("SUBTRACT", 1.0, inputs["Transmission"], clamp=True)
+    share = wiring.math("MULTIPLY", wiring.math("MULTIPLY", diffuse, opaque), inputs["Alpha"], clamp=True)
+    radiosity = wiring.scaled(wiring.vector("MULTIPLY", irradiance, inputs["Albedo"]), share)
+    emission = wiring.node("ShaderNodeEmission", radiosity, 1.0 / math.pi)
+    wiring.node("NodeGroupOutput", emission.outputs[0])
