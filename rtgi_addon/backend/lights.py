@@ -210,8 +210,8 @@ def _inverse_smoothstep_integral(y: Float64) -> Float64:
     t = np.cbrt(y) * (1 + 0.26 * y)
     for _ in range(4):
         slope = np.maximum(t * t * (3 - 2 * t), 1e-30)
-        t = np.asarray(np.clip(t - (t * t * t * (1 - t / 2) - y) / slope, 0, 1))
-    return t
+        t = np.clip(t - (t * t * t * (1 - t / 2) - y) / slope, 0, 1)
+    return np.asarray(t)
 
 
 def half_spread(light: Light) -> float:

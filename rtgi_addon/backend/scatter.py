@@ -171,9 +171,10 @@ def _special_lobes(
 def shading_normals(surfaces: Surfaces, hits: Hits, normal: Float32, direction: Float32) -> Float32:
     """(n, 3) unit interpolated normals, towards where the ray came from; the geometric ``normal`` where they fail."""
     corner = surfaces.corner_normals[hits.triangle]
-    w = (1 - hits.u - hits.v)[:, None]
-    smooth = corner[:, 0] * w + corner[:, 1] * hits.u[:, None] + corner[:, 2] * hits.v[:, None]
-    smooth *= np.where(hits.back, np.float32(-1), np.float32(1))[:, None]
+    turned = np.where(hits.back, np.float32(-1), np.float32(1))
+    weights = np.stack([(1 - hits.u - hits.v) * turned, hits.u * turned, hits.v * turned], axis=1)[:, :, None]
+    weighted = corner * weights
+    smooth: Floats = np.asarray(weighted[:, 0] + weighted[:, 1] + weighted[:, 2], np.float32)
     length = np.sqrt(dot(smooth, smooth))
     good = (length > 1e-6) & (dot(smooth, direction) < 0)
     out: Float32 = np.where(good[:, None], smooth / np.maximum(length, np.float32(1e-6))[:, None], normal)

@@ -1,0 +1,323 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Lamps, emissive meshes and the sky send out the flux and the directions that Blender's units promise."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from rtgi_addon.backend import lights as lt
+from rtgi_addon.backend.emission import MESHES, SKY, make_bounds, make_sources, photon_counts
+from rtgi_addon.backend.geometry import Geometry
+from rtgi_addon.backend.lamp_view import may_see, view_lamp
+from rtgi_addon.backend.sampling import photon_numbers, unit_float64
+from rtgi_addon.backend.scene import AreaShape, Instance, Light, LightKind, Material, Scene, World
+from tests.backend.scenes import box, constant_sky, quad, translation
+
+ORIGIN = np.array([3.0, -2.0, 1.0])
+BOX = lt.Bounds(np.array([-1.0, -2.0, -0.5]), np.array([1.0, 2.0, 0.5]))
+POWER = (10.0, 20.0, 5.0)
+
+
+def numbers(count: int = 40_000) -> list[np.ndarray]:
+    index = np.arange(count, dtype=np.uint32)
+    return [unit_float64(n) for n in photon_numbers(np.zeros(count, np.int32), index, 0)]
+
+
+def turned() -> np.ndarray:
+    """A rotation with scale, which lamps ignore."""
+    q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    matrix = np.eye(4)
+    matrix[:3, :3] = q * np.sign(np.linalg.det(q)) * 2.5
+    matrix[:3, 3] = ORIGIN + (0.2, 0.3, 2.0)
+    return matrix
+
+
+def lamp(kind: LightKind, **values) -> Light:
+    return Light("lamp", kind, turned(), POWER, **values)
+
+
+LAMPS = {
+    "point": lamp(LightKind.POINT),
+    "sphere": lamp(LightKind.POINT, radius=0.3),
+    "spot": lamp(LightKind.SPOT, cone=0.6, blend=0.4),
+    "hard spot": lamp(LightKind.SPOT, cone=0.9, blend=0.0),
+    "soft spot": lamp(LightKind.SPOT, cone=1.3, blend=1.0, radius=0.1),
+    "wide spot": lamp(LightKind.SPOT, cone=1.5, blend=0.15),
+    "area": lamp(LightKind.AREA, size=(0.5, 2.0)),
+    "ellipse": lamp(LightKind.AREA, size=(0.5, 2.0), shape=AreaShape.ELLIPSE, spread=1.4),
+    "beam": lamp(LightKind.AREA, size=(0.5, 0.5), spread=0.1),
+    "sun": lamp(LightKind.SUN, angle=0.05),
+    "sharp sun": lamp(LightKind.SUN),
+}
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_photons_carry_the_lamps_flux(name: str) -> None:
+    emission = lt.emit_lamp(LAMPS[name], numbers(), origin=ORIGIN, bounds=BOX)
+    assert np.isfinite(emission.origin).all() and (emission.weight >= 0).all()
+    assert np.allclose((emission.direction**2).sum(axis=1), 1, atol=1e-9)
+    assert emission.weight.mean(axis=0) == pytest.approx(lt.lamp_flux(LAMPS[name], BOX), rel=2e-3)
+    if not name.endswith("sun"):
+        assert np.ptp(emission.weight, axis=0).max() == 0  # equal photons: exact importance sampling
+
+
+@pytest.mark.parametrize("name", ["point", "sphere", "area", "ellipse", "beam"])
+def test_blender_watts(name: str) -> None:
+    assert lt.lamp_flux(LAMPS[name], BOX) == pytest.approx(POWER)
+
+
+def test_spot_flux_is_the_cones_share_of_the_sphere() -> None:
+    assert lt.lamp_flux(LAMPS["hard spot"], BOX) == pytest.approx(np.array(POWER) * (1 - np.cos(0.9)) / 2)
+
+
+def axis_cosine(light: Light) -> np.ndarray:
+    emission = lt.emit_lamp(light, numbers(), origin=ORIGIN, bounds=BOX)
+    return emission.direction @ lt.place_lamp(light, ORIGIN).axis
+
+
+def distribution(density, low: float, high: float):
+    """The cumulative distribution of an unnormalised density of the cosine."""
+    grid = np.linspace(low, high, 20_001)
+    cumulative = integrate.cumulative_trapezoid(density(grid), grid, initial=0)
+    return lambda x: np.interp(x, grid, cumulative / cumulative[-1])
+
+
+@pytest.mark.parametrize("name", ["spot", "soft spot", "wide spot"])
+def test_spot_photons_follow_the_profile(name: str) -> None:
+    light = LAMPS[name]
+    cdf = distribution(lambda c: lt.spot_profile(c, light.cone, light.blend), np.cos(light.cone), 1)
+    cosine = axis_cosine(light)
+    assert (cosine >= np.cos(light.cone) - 1e-12).all()
+    assert stats.kstest(cosine, cdf).statistic < 1e-3
+    area = integrate.quad(lambda c: float(lt.pdf_spot(np.array(c), light.cone, light.blend)), np.cos(light.cone), 1)[0]
+    assert 2 * np.pi * area == pytest.approx(1, rel=1e-6)
+
+
+@pytest.mark.parametrize("spread", [0.1, 1.4, 3.0])
+def test_spread_photons_follow_the_profile_and_keep_the_power(spread: float) -> None:
+    light = replace(LAMPS["area"], spread=spread)
+    half = spread / 2
+    cdf = distribution(lambda c: lt.pdf_spread(c, half), np.cos(half), 1)
+    assert stats.kstest(axis_cosine(light), cdf).statistic < 1e-3
+    total = integrate.quad(lambda c: float(lt.pdf_spread(np.array(c), half)), np.cos(half), 1, limit=200)[0]
+    assert 2 * np.pi * total == pytest.approx(1, rel=1e-6)
+
+
+def test_lambertian_area_is_the_limit_of_the_spread() -> None:
+    cosine = np.linspace(0.05, 1, 50)
+    assert lt.spread_profile(cosine, (np.pi - 2e-3) / 2) == pytest.approx(np.ones(50), rel=0.03)
+
+
+def test_area_photons_start_on_the_lamp() -> None:
+    for name, limit in (("area", np.inf), ("ellipse", 1.0)):
+        light = LAMPS[name]
+        emission = lt.emit_lamp(light, numbers(4000), origin=ORIGIN, bounds=BOX)
+        place = lt.place_lamp(light, ORIGIN)
+        local = emission.origin - place.position
+        x, y = local @ place.x / 0.25, local @ place.y / 1.0
+        assert np.abs(local @ place.axis).max() < 1e-9
+        assert max(np.abs(x).max(), np.abs(y).max()) <= 1 + 1e-9 and np.abs(x).max() > 0.95
+        assert (x**2 + y**2).max() <= limit + 1e-9
+
+
+def test_sphere_lamp_is_lambertian() -> None:
+    """Photon lines pass the centre at distances uniform on a disk, whatever their direction."""
+    light = LAMPS["sphere"]
+    emission = lt.emit_lamp(light, numbers(), origin=ORIGIN, bounds=BOX)
+    local = emission.origin - lt.place_lamp(light, ORIGIN).position
+    assert np.abs((local * emission.direction).sum(axis=1)).max() < 1e-9
+    assert stats.kstest((local**2).sum(axis=1) / 0.09, "uniform").statistic < 1e-3
+
+
+def test_photons_enter_the_box_evenly() -> None:
+    direction = np.tile([0.6, -0.48, 0.64], (40_000, 1))
+    u, v, choice = np.random.default_rng(0).random((3, 40_000))
+    start, area = lt.enter_box(direction, BOX, u, v, choice)
+    assert ((start >= BOX.low - 1e-12) & (start <= BOX.high + 1e-12)).all()
+    assert area[0] == pytest.approx(0.6 * 4 + 0.48 * 2 + 0.64 * 8)
+    # Every start lies on a face that is turned against the light, in proportion to its outline.
+    on_x, on_y, on_z = start[:, 0] == -1, start[:, 1] == 2, start[:, 2] == -0.5
+    assert (on_x | on_y | on_z).all()
+    assert [on_x.mean(), on_y.mean(), on_z.mean()] == pytest.approx([2.4 / 8.48, 0.96 / 8.48, 5.12 / 8.48], abs=0.01)
+
+
+DARK = [
+    Light("a", LightKind.POINT, np.eye(4), (0, 0, 0), radius=0.1),
+    Light("b", LightKind.SPOT, np.eye(4), (1, 1, 1), cone=0.0),
+    Light("c", LightKind.AREA, np.eye(4), (1, 1, 1), size=(0.0, 1.0)),
+    Light("d", LightKind.SUN, np.eye(4), (0, 0, 0)),
+]
+
+
+@pytest.mark.parametrize("light", DARK, ids=lambda light: light.kind)
+def test_a_dark_lamp_has_no_photons(light: Light) -> None:
+    scene = Scene(
+        (quad("q", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]),), (Instance("q", 0, np.eye(4)),), (Material("m"),)
+    )
+    state = replace(scene.first_frame(), lights=(light,))
+    geometry = Geometry(scene, state)
+    sources = make_sources(scene, state, geometry, make_bounds(geometry))
+    assert sources == [] and photon_counts(sources, 1000) == {}
+
+
+def test_photons_are_shared_by_flux_and_every_source_has_one() -> None:
+    scene = Scene(
+        (box("b", (1, 1, 1), texels=2),), (Instance("b", 0, np.eye(4)),), (Material("m", emission=(1, 2, 0)),)
+    )
+    lamps = (replace(LAMPS["point"], power=(1e-9, 0, 0)), replace(LAMPS["area"], power=(30.0, 10.0, 0.0)))
+    state = replace(scene.first_frame(), lights=lamps, world=constant_sky(1.0))
+    geometry = Geometry(scene, state)
+    sources = make_sources(scene, state, geometry, make_bounds(geometry))
+    counts = photon_counts(sources, 10_000)
+    flux = {s.light: max(s.flux) for s in sources}
+    assert set(counts) == {0, 1, MESHES, SKY} and sum(counts.values()) == 10_000
+    assert counts[0] == 1
+    # Both sides emit: 2 · π · 6 m² · 2 W/(m² sr).
+    assert flux[MESHES] == pytest.approx(24 * np.pi, rel=1e-6)
+    for light in (1, MESHES, SKY):
+        assert counts[light] / 10_000 == pytest.approx(flux[light] / sum(flux.values()), abs=2e-3)
+
+
+def emissive_scene() -> Scene:
+    image = np.zeros((4, 4, 3), np.float32)
+    image[1, 2] = (8.0, 4.0, 0.0)
+    mesh = quad("screen", [(0, 0, 0), (2, 0, 0), (2, 1, 0), (0, 1, 0)])
+    return Scene((replace(mesh, emission_map=image),), (Instance("screen", 0, np.eye(4)),), (Material("m"),))
+
+
+@pytest.mark.parametrize("sides", [(True, True), (True, False), (False, True)])
+def test_emission_maps_are_drawn_where_they_glow(sides: tuple[bool, bool]) -> None:
+    scene = emissive_scene()
+    state = scene.first_frame()
+    geometry = Geometry(scene, state)
+    (source,) = make_sources(scene, state, geometry, make_bounds(geometry), sides=np.array([sides]))
+    emission = source.emit(numbers())
+    pixel = 2.0 / 16
+    expected = np.array([8.0, 4.0, 0.0]) * np.pi * pixel * sum(sides)
+    assert emission.weight.mean(axis=0) == pytest.approx(expected, rel=0.03)
+    glowing = emission.weight[:, 0] > 0
+    start = emission.origin[glowing] + geometry.origin
+    assert start[:, 0].min() >= 1.0 - 1e-5 and start[:, 0].max() <= 1.5 + 1e-5
+    assert start[:, 1].min() >= 0.25 - 1e-5 and start[:, 1].max() <= 0.5 + 1e-5
+    up = emission.direction[glowing, 2] > 0
+    assert up.mean() == pytest.approx(sides[0] / sum(sides), abs=0.02)
+    assert (emission.origin[glowing, 2] > 0).tolist() == up.tolist()
+
+
+def test_sky_photons_carry_the_maps_light() -> None:
+    """Through a cube, E = π L: flux is L · 4π · mean outline; of a patch, L · Ω · outline."""
+    scene = Scene((box("b", (2, 2, 2), texels=2),), (Instance("b", 0, np.eye(4)),), (Material("m"),))
+    image = np.zeros((8, 16, 3), np.float32)
+    image[6, 3] = (5.0, 1.0, 0.0)
+    for world in (constant_sky(0.5), World(image)):
+        state = replace(scene.first_frame(), world=world)
+        geometry = Geometry(scene, state)
+        bounds = lt.Bounds(-np.ones(3), np.ones(3))
+        (source,) = make_sources(scene, state, geometry, bounds)
+        emission = source.emit(numbers())
+        if world.radiance.size == 3:
+            assert emission.weight.mean(axis=0) == pytest.approx(np.full(3, 0.5 * np.pi * 24), rel=5e-3)
+            continue
+        towards = -emission.direction
+        low, high = np.sin(np.pi * (6 / 8 - 0.5)), np.sin(np.pi * (7 / 8 - 0.5))
+        assert towards[:, 2].min() >= low - 1e-6 and towards[:, 2].max() <= high + 1e-6
+        u = 0.5 - np.arctan2(towards[:, 1], towards[:, 0]) / (2 * np.pi)
+        assert u.min() >= 3 / 16 - 1e-6 and u.max() <= 4 / 16 + 1e-6
+        outline = np.abs(towards).sum(axis=1).mean() * 4
+        solid_angle = (high - low) * 2 * np.pi / 16
+        assert emission.weight[:, 0].mean() == pytest.approx(5 * solid_angle * outline, rel=5e-3)
+
+
+VIEWS = {
+    "point": (LAMPS["point"], lambda d, c: c / (4 * np.pi * d**2)),
+    "soft": (replace(LAMPS["point"], radius=0.4), lambda d, c: c / (4 * np.pi * (d**2 + 0.16))),
+    "sphere": (replace(LAMPS["point"], radius=0.4, soft_falloff=False), lambda d, c: c / (4 * np.pi * d**2)),
+}
+
+
+@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("distance", [0.9, 3.0, 50.0])
+def test_irradiance_of_round_lamps(name: str, distance: float) -> None:
+    """Closed forms measured in Cycles: a facing disk P c / (4π (d² + r²)), a sphere P c / (4π d²)."""
+    light, expected = VIEWS[name]
+    towards = np.array([0.36, 0.48, 0.8])
+    normal = np.array([0.0, 0.0, 1.0], np.float32)
+    point = lt.place_lamp(light, ORIGIN).position - towards * distance
+    u, v, *_ = numbers(20_000)
+    points = np.tile(point.astype(np.float32), (len(u), 1))
+    view = view_lamp(
+        light,
+        points,
+        u.astype(np.float32),
+        v.astype(np.float32),
+        origin=ORIGIN,
+        nearest=np.full(len(u), 1e-6, np.float32),
+        far=9,
+    )
+    mean = (view.strength * np.maximum(view.direction @ normal, 0)).mean(dtype=np.float64)
+    assert mean == pytest.approx(expected(distance, 0.8), rel=3e-3)
+    assert np.abs(view.distance - distance).max() <= 0.45
+
+
+@pytest.mark.parametrize("name", [n for n in LAMPS if "sun" not in n])
+def test_what_points_see_is_what_lamps_send(name: str) -> None:
+    """Far out, irradiance over a sphere around the lamp adds up to its flux: photons and shadow rays agree."""
+    light = LAMPS[name]
+    place = lt.place_lamp(light, ORIGIN)
+    count = 200_000
+    rng = np.random.default_rng(5)
+    out = rng.normal(size=(count, 3))
+    out /= np.linalg.norm(out, axis=1, keepdims=True)
+    if name == "beam":  # half a degree wide: look only where it goes
+        z = 1 - rng.random(count) * (1 - np.cos(0.06))
+        angle = rng.random(count) * 2 * np.pi
+        r = np.sqrt(1 - z * z)
+        out = np.outer(r * np.cos(angle), place.x) + np.outer(r * np.sin(angle), place.y) + np.outer(z, place.axis)
+    sphere = 4 * np.pi * 400**2 * ((1 - np.cos(0.06)) / 2 if name == "beam" else 1)
+    points = (place.position + 400 * out).astype(np.float32)
+    u, v = rng.random((2, count)).astype(np.float32)
+    view = view_lamp(light, points, u, v, origin=ORIGIN, nearest=np.full(count, 1e-4, np.float32), far=9)
+    strength = view.strength * -(view.direction * out).sum(axis=1)
+    assert (strength > -1e-9).all()
+    flux = strength.mean() * sphere * np.array(POWER)
+    assert flux == pytest.approx(lt.lamp_flux(light, BOX), rel=0.02)
+
+
+def test_sun_gives_its_strength_on_a_facing_plane() -> None:
+    for angle in (0.0, 0.05, 1.0):
+        light = lamp(LightKind.SUN, angle=angle)
+        u, v, *_ = (n.astype(np.float32) for n in numbers(20_000))
+        view = view_lamp(light, np.zeros((len(u), 3), np.float32), u, v, origin=ORIGIN, nearest=u, far=77.0)
+        facing = -lt.place_lamp(light, ORIGIN).axis
+        mean = (view.strength * (view.direction @ facing)).mean(dtype=np.float64)
+        assert mean == pytest.approx(1, rel=1e-3)
+        assert (view.distance == 77).all()
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_may_see_never_hides_a_lit_point(name: str) -> None:
+    light = LAMPS[name]
+    rng = np.random.default_rng(11)
+    count = 30_000
+    points = rng.normal(scale=3, size=(count, 3)).astype(np.float32)
+    normals = rng.normal(size=(count, 3)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    seen = may_see(light, points, normals, np.full(count, 1e-4, np.float32), origin=ORIGIN)
+    u, v = rng.random((2, count)).astype(np.float32)
+    view = view_lamp(light, points, u, v, origin=ORIGIN, nearest=np.full(count, 1e-6, np.float32), far=9)
+    lit = (view.strength > 0) & ((view.direction * normals).sum(axis=1) > 1e-5)
+    assert not (lit & ~seen).any()
+    assert lit.any() and (~seen).any()
+
+
+def test_lamp_in_front_of_nothing_and_on_the_point_itself() -> None:
+    light = Light("l", LightKind.POINT, translation(0, 0, 0), (1, 1, 1), radius=0.1)
+    zero = np.zeros((3, 3), np.float32)
+    view = view_lamp(
+        light, zero, zero[:, 0], zero[:, 0], origin=np.zeros(3), nearest=np.full(3, 1e-3, np.float32), far=1
+    )
+    assert np.isfinite(view.strength).all() and np.isfinite(view.direction).all()
