@@ -1,0 +1,241 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One bake: the state that lives between frames, and the stages of a frame in their order.
+
+``Session.advance`` is the page that lists them: place → direct → caustics → links → aim → finish (seams, denoise,
+pages). Only the session keeps state; every stage is a function of arrays.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+import numpy as np
+
+from . import caustics, emission, photon_map, photons, radiosity
+from .direct import direct_irradiance, make_shadows
+from .finish import Finisher
+from .geometry import Geometry
+from .links import Links, LinkTracer, bright_targets, trace_links
+from .parallel import Workers
+from .progress import Report, silent
+from .radiosity import Illumination
+from .scatter import Surfaces, make_surfaces
+from .scene import Atlas, Float32, FrameState, LightMaps, Scene
+from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts
+from .sky import Sky, make_sky
+from .stats import FrameStats
+from .texels import TexelFrame, make_texels, place_texels, texel_colours
+from .tracing import EmbreeTracer
+
+#: Each frame has so many stages to report.
+STAGE_COUNT = 6
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    maps: LightMaps
+    stats: FrameStats
+
+
+@dataclass(frozen=True)
+class _Placed:
+    """One frame's scene, ready to be lit; n texels, m targets (texels and sky patches)."""
+
+    state: FrameState
+    frame: TexelFrame
+    surfaces: Surfaces
+    albedo: Float32  # (n, 3)
+    emitted: Float32  # (m, 3) radiosity that targets send of themselves, W/m²
+    sky: Sky | None
+
+
+class Session:
+    """A bake of one scene into one atlas. Close it, or use it in a ``with``, to give its threads back."""
+
+    def __init__(
+        self,
+        scene: Scene,
+        atlas: Atlas,
+        settings: BakeSettings,
+        state: FrameState,
+        *,
+        oidn_paths: Sequence[Path] = (),
+        report: Report = silent,
+    ) -> None:
+        """``state`` is the first frame to bake. ``oidn_paths``: where Open Image Denoise's library may lie.
+
+        Raises BakeError when the settings ask for what this machine does not have.
+        """
+        self.scene, self.atlas, self.settings = scene, atlas, settings
+        self._report = report
+        self._workers = Workers(settings.threads)
+        self.geometry = Geometry(scene, state)
+        self._tracer = EmbreeTracer(scene, self.geometry, state, self._workers)
+        self.texels = make_texels(scene, atlas, self.geometry)
+        self._bounds = emission.make_bounds(self.geometry)
+        self._finisher = Finisher(self.texels, settings, oidn_paths)
+
+    def close(self) -> None:
+        """Give threads and the denoiser back."""
+        self._workers.close()
+        self._finisher.close()
+
+    def __enter__(self) -> Session:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None) -> None:
+        self.close()
+
+    def advance(self, state: FrameState) -> FrameResult:
+        """Light the frame ``state``."""
+        stats = FrameStats(texels_updated=self.texels.count, surfaces_updated=self.texels.surface_count)
+        with stats.stage("place"):
+            placed = self._place(state)
+        self._report("place", 1, STAGE_COUNT)
+        with stats.stage("direct"):
+            direct = self._direct(placed, stats)
+        self._report("direct", 2, STAGE_COUNT)
+        with stats.stage("caustics"):
+            caustic = self._caustics(placed, stats)
+        self._report("caustics", 3, STAGE_COUNT)
+        outside = direct if caustic is None else direct + caustic
+        links, light = self._gather_to_target(placed, outside, stats)
+        return FrameResult(self._finish(placed, links, light, caustic, stats), stats)
+
+    # --- stages ---------------------------------------------------------------------------------------------------
+
+    def _place(self, state: FrameState) -> _Placed:
+        changed = self.geometry.update(state)
+        self._tracer.update(state, changed)
+        frame = place_texels(self.texels, self.geometry)
+        materials = state.materials or self.scene.materials
+        albedo, glow = texel_colours(self.texels, self.scene, self.geometry, materials)
+        surfaces = make_surfaces(self.geometry, self.texels, albedo, materials)
+        sky = make_sky(state.world)
+        emitted = glow * np.float32(np.pi)
+        if sky is not None:
+            emitted = np.concatenate([emitted, sky.radiance * np.float32(np.pi)])
+        return _Placed(state, frame, surfaces, np.clip(albedo, 0, 1), emitted, sky)
+
+    def _direct(self, placed: _Placed, stats: FrameStats) -> Float32:
+        """(n, 3) from lamps, by shadow rays; by photons when the settings say so."""
+        if self.settings.aim_direct is AimDirect.PHOTONS:
+            paths = self._photons(placed, stats)
+            hits = photon_map.direct_hits(paths) & photon_map.lamp_hits(paths)
+            return self._density(paths, hits, placed)
+        materials = placed.state.materials or self.scene.materials
+        shadows = make_shadows(self._tracer, self.geometry, materials)
+        direct, rays = direct_irradiance(
+            placed.state.lights, placed.frame, shadows, self._workers,
+            samples=self.settings.direct_samples, seed=self.settings.seed,
+        )  # fmt: skip
+        stats.rays += rays
+        return direct
+
+    def _caustics(self, placed: _Placed, stats: FrameStats) -> Float32 | None:
+        """(n, 3) from lamps by way of mirrors and glass; None where the scene has none, or they are not asked for."""
+        if self.settings.caustics is Caustics.OFF:
+            return None
+        materials = placed.state.materials or self.scene.materials
+        generators = caustics.find_generators(self.scene, placed.state, self.geometry, materials)
+        sources = caustics.caustic_sources(placed.state, self.geometry, self._bounds, generators)
+        if not sources:
+            return np.zeros_like(placed.albedo) if self.settings.caustics is Caustics.ON else None
+        paths, book = caustics.trace_caustics(
+            sources, photons=self.settings.photons, surfaces=placed.surfaces, tracer=self._tracer,
+            workers=self._workers, max_bounces=self.settings.max_specular + 1, seed=self.settings.seed,
+        )  # fmt: skip
+        stats.rays += book.rays
+        stats.photons_traced += len(paths.light)
+        k = self.settings.nearest_photons
+        return caustics.caustic_irradiance(paths, self.texels, placed.frame, self._workers, k=k)
+
+    def _gather_to_target(self, placed: _Placed, outside: Float32, stats: FrameStats) -> tuple[Links, Illumination]:
+        """Links and light with as many rays as the settings name, or as the target error needs."""
+        samples = self.settings.samples
+        with stats.stage("links"):
+            links = self._links(placed, outside, samples, stats)
+        self._report("links", 4, STAGE_COUNT)
+        with stats.stage("aim"):
+            light = self._light(placed, outside, links, stats)
+        self._report("aim", 5, STAGE_COUNT)
+        return links, light
+
+    def _links(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> Links:
+        known = placed.emitted.copy()
+        known[: self.texels.count] += placed.albedo * outside
+        bright = bright_targets(known, placed.frame.area, placed.sky, self.geometry.extent)
+        tracer = LinkTracer(
+            self.texels, placed.frame, self.geometry, placed.surfaces, self._tracer, placed.sky, bright, samples,
+            max_specular=self.settings.max_specular, seed=self.settings.seed,
+        )  # fmt: skip
+        links = trace_links(tracer, self.texels.count, len(placed.emitted), samples, self._workers)
+        stats.rays += links.rays
+        stats.links_traced += links.rays
+        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
+        return links
+
+    def _light(self, placed: _Placed, outside: Float32, links: Links, stats: FrameStats) -> Illumination:
+        if self.settings.aim_bounced is not AimBounced.PHOTONS:
+            return radiosity.solve(links, outside, placed.albedo, placed.emitted)
+        paths = self._photons(placed, stats)
+        # Sky and emissive meshes land in the AIM with their first hit; lamps' first hits are in `outside`.
+        hits = photon_map.bounced_hits(paths) | (photon_map.direct_hits(paths) & ~photon_map.lamp_hits(paths))
+        aim = outside + self._density(paths, hits, placed)
+        return Illumination(aim, radiosity.gather(links, aim, placed.albedo, placed.emitted), 1, 0.0)
+
+    def _photons(self, placed: _Placed, stats: FrameStats) -> photons.PhotonPaths:
+        sources = emission.make_sources(self.scene, placed.state, self.geometry, self._bounds)
+        counts = emission.photon_counts(sources, self.settings.photons)
+        light, index = emission.all_photons(counts)
+        paths, book = photons.trace_photons(
+            sources, counts, light, index, surfaces=placed.surfaces, tracer=self._tracer, workers=self._workers,
+            max_bounces=self.settings.max_bounces, seed=self.settings.seed,
+        )  # fmt: skip
+        stats.rays += book.rays
+        stats.photons_traced += len(paths.light)
+        return paths
+
+    def _density(self, paths: photons.PhotonPaths, hits: np.ndarray, placed: _Placed) -> Float32:
+        found = photon_map.make_photon_map(paths, self.texels, hits)
+        k = self.settings.nearest_photons
+        return photon_map.photon_irradiance(found, self.texels, placed.frame, self._workers, k=k)
+
+    def _finish(
+        self, placed: _Placed, links: Links, light: Illumination, caustic: Float32 | None, stats: FrameStats
+    ) -> LightMaps:
+        """Maps of texels as pages; also the estimate of the IIM's error, from half of the rays."""
+        end, valid = self._finisher, links.valid
+        known = placed.emitted.copy()
+        known[: self.texels.count] += placed.albedo * light.aim
+        iim = end.fill(light.iim, valid)
+        half = end.fill(links.irradiance(known, half=0), valid)
+        with stats.stage("denoise"):
+            iim, half = end.denoise(iim), end.denoise(half)
+        stats.estimated_error = noise_estimate(iim, half)
+        stats.warnings += end.warnings
+        with stats.stage("pages"):
+            maps = LightMaps(
+                frame=placed.state.frame,
+                iim=end.to_pages(iim),
+                aim=end.to_pages(end.fill(light.aim, valid)),
+                caustics=None if caustic is None else end.to_pages(end.fill(caustic, valid)),
+                valid=end.valid_pages(valid),
+            )
+        self._report("finish", STAGE_COUNT, STAGE_COUNT)
+        return maps
+
+
+def noise_estimate(full: Float32, half: Float32) -> float | None:
+    """Relative RMS noise of ``full`` (n, 3) from how far ``half`` (n, 3), made of half its rays, lies from it.
+
+    With σ² the variance of ``full``, that of ``half`` is 2σ² and their covariance σ², so their difference has σ².
+    None where ``full`` is black.
+    """
+    mean = float(full.mean(dtype=np.float64)) if full.size else 0.0
+    if not mean > 0:
+        return None
+    return float(np.sqrt(np.mean((full - half) ** 2, dtype=np.float64))) / mean

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What a frame cost and how good it is: the numbers of ``bake.json``."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+
+
+@dataclass
+class FrameStats:
+    """Counts of one frame; filled stage by stage."""
+
+    seconds: dict[str, float] = field(default_factory=dict)  # by stage
+    rays: int = 0
+    photons_traced: int = 0
+    photons_kept: int = 0
+    links_traced: int = 0
+    links_kept: int = 0
+    texels_updated: int = 0
+    texels_kept: int = 0
+    surfaces_updated: int = 0
+    surfaces_kept: int = 0
+    gather: str = "links"
+    cosine_rays: int = 0  # per texel
+    bright_rays: int = 0  # per texel
+    estimated_error: float | None = None  # relative RMS error of the IIM; None where the IIM is black
+    warnings: list[str] = field(default_factory=list)
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Adds the time spent inside to ``seconds[name]``."""
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
