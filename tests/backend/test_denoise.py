@@ -1,0 +1,268 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""OIDN by ctypes, and the light-map use of it: what it removes, what it must keep, what may not touch what."""
+
+from __future__ import annotations
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rtgi_addon.backend.denoise import MOST_GAIN, MapDenoiser
+from rtgi_addon.backend.oidn import Denoiser, FilterKind, OidnError, find_oidn
+
+
+def bpy_libraries() -> list[Path]:
+    """bpy's folder of shared libraries, without importing bpy."""
+    spec = importlib.util.find_spec("bpy")
+    return [Path(spec.origin).parent / "lib"] if spec and spec.origin else []
+
+
+LIBRARY = find_oidn(bpy_libraries())
+needs_oidn = pytest.mark.skipif(LIBRARY is None, reason="no OIDN 2 library in bpy's folder")
+
+
+@pytest.fixture(scope="module")
+def denoiser():
+    with Denoiser(LIBRARY) as opened:
+        yield opened
+
+
+def layout(*boxes: tuple[int, int, int, int], size: int = 96) -> tuple[np.ndarray, np.ndarray]:
+    """One page with boxes (row, col, height, width): (1, size, size) texel index, (n,) surface of each texel."""
+    island = np.full((1, size, size), -1)
+    for number, (row, col, height, width) in enumerate(boxes):
+        island[0, row : row + height, col : col + width] = number
+    index = np.full(island.shape, -1, np.int32)
+    index[island >= 0] = np.arange((island >= 0).sum())
+    return index, island[island >= 0].astype(np.int32)
+
+
+FOUR = layout((3, 3, 40, 40), (3, 47, 40, 40), (47, 3, 40, 40), (47, 47, 11, 23))
+
+
+def noise(count: int, seed: int = 0, shape: float = 8.0) -> np.ndarray:
+    """(count, 3) of mean 1, like a path tracer's: relative deviation shape**-0.5, long tail."""
+    return np.random.default_rng(seed).gamma(shape, 1 / shape, (count, 3)).astype(np.float32)
+
+
+def test_find_looks_in_order_and_takes_files_only(tmp_path):
+    name = LIBRARY.name if LIBRARY else "libOpenImageDenoise.so.2"
+    first, second, third = (tmp_path / n for n in "abc")
+    for folder in (second, third):
+        folder.mkdir()
+        (folder / name).write_bytes(b"")
+    assert find_oidn([first, third, second]) == third / name
+    (first / name).mkdir(parents=True)
+    assert find_oidn([first]) is None and find_oidn([]) is None
+
+
+def test_what_is_no_library_says_so(tmp_path):
+    broken = tmp_path / "libOpenImageDenoise.so.2"
+    broken.write_bytes(b"not a library")
+    with pytest.raises(OidnError, match="cannot be loaded"):
+        Denoiser(broken)
+    with pytest.raises(OidnError, match=r"missing\.so"):
+        Denoiser(tmp_path / "missing.so")
+
+
+@needs_oidn
+def test_a_missing_filter_is_named():
+    """Blender's build may or may not have the light-map filter: it works, or the error tells version and filter."""
+    try:
+        opened = Denoiser(LIBRARY, kind=FilterKind.RT_LIGHTMAP)
+    except OidnError as error:
+        assert "has no RTLightmap filter" in str(error) and "Open Image Denoise:" in str(error)
+    else:
+        with opened:
+            flat = opened.denoise(np.full((64, 64, 3), 2, np.float32))
+        np.testing.assert_allclose(flat[20:-20, 20:-20], 2, rtol=0.01)
+
+
+@needs_oidn
+def test_not_finite_is_refused_with_a_count(denoiser):
+    image = np.ones((8, 8, 3), np.float32)
+    image[2, 3, 1], image[4, 4], image[7, 7, 0] = np.nan, np.inf, -np.inf
+    with pytest.raises(ValueError, match="3 of 64 texels are not finite"):
+        denoiser.denoise(image)
+    values = noise(len(FOUR[1]))
+    values[5, 2] = np.nan
+    with pytest.raises(ValueError, match="1 of 5053 texels are not finite"):
+        MapDenoiser(denoiser, *FOUR).denoise(values)
+    values[5, 2] = -1
+    with pytest.raises(ValueError, match="1 texels are negative"):
+        MapDenoiser(denoiser, *FOUR).denoise(values)
+
+
+@needs_oidn
+@pytest.mark.parametrize("shape", [(8, 8), (8, 8, 4), (0, 8, 3)])
+def test_wrong_shapes_are_refused(denoiser, shape):
+    with pytest.raises(ValueError, match="shape"):
+        denoiser.denoise(np.zeros(shape, np.float32))
+
+
+@needs_oidn
+def test_closed_denoiser_is_refused():
+    opened = Denoiser(LIBRARY)
+    opened.close()
+    opened.close()
+    with pytest.raises(ValueError, match="closed"):
+        opened.denoise(np.ones((8, 8, 3), np.float32))
+
+
+@needs_oidn
+def test_same_bits_for_any_thread_count():
+    image = noise(100 * 75).reshape(100, 75, 3)
+    results = []
+    for threads in (1, 2, 3, 0):
+        with Denoiser(LIBRARY, threads=threads) as opened:
+            results.append(opened.denoise(image))
+            np.testing.assert_array_equal(opened.denoise(image), results[0])
+    for other in results:
+        np.testing.assert_array_equal(other, results[0])
+
+
+@needs_oidn
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (5, 3), (17, 31)])
+def test_odd_sizes_and_views(denoiser, size):
+    image = noise(size[0] * size[1]).reshape(*size, 3)
+    result = denoiser.denoise(image)
+    assert result.shape == image.shape and np.isfinite(result).all() and (result >= 0).all()
+    # Rows reversed and float64: same pixels, other memory layout.
+    np.testing.assert_array_equal(denoiser.denoise(image[::-1].copy()[::-1].astype(np.float64)), result)
+
+
+@needs_oidn
+def test_noise_goes_and_structure_stays(denoiser):
+    """A soft shadow edge and a gradient under 35 % noise: at most a quarter of the noise is left."""
+    index, surface = FOUR
+    _, row, col = np.nonzero(index >= 0)
+    truth = 1 + row / 40 + 1.5 / (1 + np.exp(-(col % 44 - 22) / 1.5))
+    truth = np.repeat(truth[:, None], 3, axis=1).astype(np.float32)
+    noisy = truth * noise(len(surface))
+    result = MapDenoiser(denoiser, index, surface).denoise(noisy)
+
+    def rms(values):
+        return np.sqrt(np.mean((values - truth) ** 2)) / truth.mean()
+
+    assert rms(noisy) > 0.3 and rms(result) < rms(noisy) / 4
+    edge = np.isin(row, [3, 4, 41, 42]) | np.isin(col, [3, 4, 41, 42])
+    # A border texel has neighbours on one side only, twice the variance; darkening would add to that.
+    assert np.sqrt(np.mean((result - truth)[edge] ** 2)) < 1.7 * np.sqrt(np.mean((result - truth) ** 2))
+
+
+@needs_oidn
+@settings(max_examples=12, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    exponents=st.lists(st.integers(-30, 30), min_size=4, max_size=4),
+)
+def test_each_surface_scales_by_itself(denoiser, seed, exponents):
+    """A surface 2^60 times brighter than its neighbour does not change it: same bits, times a power of two."""
+    index, surface = FOUR
+    maps = MapDenoiser(denoiser, index, surface)
+    values = noise(len(surface), seed)
+    factor = np.ldexp(1.0, exponents).astype(np.float32)[surface][:, None]
+    np.testing.assert_allclose(maps.denoise(values * factor), maps.denoise(values) * factor, rtol=1e-5)
+
+
+@needs_oidn
+@pytest.mark.parametrize("factor", [1e-6, 0.3, 1e6])
+def test_scale_of_the_whole(denoiser, factor):
+    values = noise(len(FOUR[1]))
+    maps = MapDenoiser(denoiser, *FOUR)
+    np.testing.assert_allclose(maps.denoise(values * np.float32(factor)), maps.denoise(values) * factor, rtol=1e-3)
+
+
+@needs_oidn
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), shape=st.floats(0.5, 20))
+def test_each_surface_keeps_its_mean(denoiser, seed, shape):
+    index, surface = FOUR
+    values = noise(len(surface), seed, shape) * np.array([1, 10, 0.1], np.float32)
+    result = MapDenoiser(denoiser, index, surface).denoise(values)
+    assert np.isfinite(result).all() and (result >= 0).all()
+    for number in range(4):
+        before, after = (v[surface == number].mean(axis=0, dtype=np.float64) for v in (values, result))
+        np.testing.assert_allclose(after, before, rtol=1e-5)
+
+
+@needs_oidn
+def test_one_firefly_is_not_amplified(denoiser):
+    """All the light of a surface in one texel: the result is finite and holds at most that light."""
+    index, surface = FOUR
+    values = np.zeros((len(surface), 3), np.float32)
+    values[100] = 1e6
+    result = MapDenoiser(denoiser, index, surface).denoise(values)
+    assert np.isfinite(result).all() and result.sum(dtype=np.float64) <= 3.03e6
+    assert result.max() <= MOST_GAIN * 1e6 and not result[surface != surface[100]].any()
+
+
+@needs_oidn
+@pytest.mark.parametrize("colour", [(1, 1, 1), (5, 0.2, 0.01), (1e6, 1, 1e-6)])
+def test_constants_stay(denoiser, colour):
+    """OIDN's own ripple on flat grey is what is left; colours add nothing to it, since each channel is divided out."""
+    index, surface = FOUR
+    flat = np.broadcast_to(np.float32(colour), (len(surface), 3))
+    result = MapDenoiser(denoiser, index, surface).denoise(flat)
+    np.testing.assert_allclose(result, flat, rtol=5e-3)
+
+
+@needs_oidn
+def test_black_channels_and_surfaces_stay_black(denoiser):
+    index, surface = FOUR
+    values = noise(len(surface))
+    values[surface == 1] = 0
+    values[surface == 2, 1] = 0
+    result = MapDenoiser(denoiser, index, surface).denoise(values)
+    assert not result[surface == 1].any() and not result[surface == 2, 1].any()
+    np.testing.assert_allclose(result[surface == 2][:, [0, 2]], 1, atol=0.25)  # 0.35 before
+
+
+@needs_oidn
+def test_neighbours_do_not_bleed(denoiser):
+    """A gap of 4 texels: what a dark surface becomes hardly depends on its neighbour's structure."""
+    index, surface = FOUR
+    values = noise(len(surface))
+    other = values.copy()
+    other[surface == 1] *= np.where(np.arange((surface == 1).sum()) % 40 < 5, 1000, 1)[:, None].astype(np.float32)
+    maps = MapDenoiser(denoiser, index, surface)
+    before, after = maps.denoise(values), maps.denoise(other)
+    dark = (after - before)[surface == 0].reshape(40, 40, 3)
+    assert np.abs(dark.mean()) < 0.01 and np.sqrt((dark[:, -2:] ** 2).mean()) < 0.05
+    np.testing.assert_allclose(after[surface == 0].mean(), values[surface == 0].mean(), rtol=1e-5)
+
+
+@needs_oidn
+def test_tiny_surfaces(denoiser):
+    """One texel is its own mean: unchanged. Slivers stay finite and keep theirs."""
+    index, surface = layout((0, 0, 1, 1), (0, 5, 1, 30), (4, 0, 2, 2), (95, 95, 1, 1), (10, 10, 40, 1))
+    values = noise(len(surface), shape=2)
+    result = MapDenoiser(denoiser, index, surface).denoise(values)
+    single = np.isin(surface, [0, 3])
+    np.testing.assert_allclose(result[single], values[single], rtol=1e-5)
+    for number in range(5):
+        np.testing.assert_allclose(
+            result[surface == number].mean(axis=0), values[surface == number].mean(axis=0), rtol=1e-4
+        )
+
+
+@needs_oidn
+def test_no_texels_at_all(denoiser):
+    empty = MapDenoiser(denoiser, np.full((2, 32, 32), -1, np.int32), np.zeros(0, np.int32))
+    assert empty.denoise(np.zeros((0, 3), np.float32)).shape == (0, 3)
+
+
+@needs_oidn
+def test_pages_are_independent(denoiser):
+    """The same island on a page of its own, wherever it lies there in steps of the filter's grid."""
+    index, surface = layout((3, 3, 40, 40))
+    values = noise(len(surface))
+    alone = MapDenoiser(denoiser, index, surface).denoise(values)
+    two = np.concatenate([np.where(index >= 0, index + 1600, -1), np.full_like(index, -1), index])
+    both = MapDenoiser(denoiser, two, np.repeat(np.int32([0, 1]), 1600)).denoise(np.concatenate([values, values * 2]))
+    np.testing.assert_array_equal(both[:1600], alone)
+    np.testing.assert_array_equal(both[1600:], alone * 2)
