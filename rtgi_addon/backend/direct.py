@@ -95,7 +95,7 @@ def lamp_irradiance(
     offset = geometry.offset_length(frame.position)
     reach = offset
     if samples > 1:
-        reach = reach + 0.5 * (_length(frame.tangent_u) + _length(frame.tangent_v))
+        reach = reach + _length(frame.points - frame.position[:, None]).max(axis=1)
     lit = may_see(light, frame.position, frame.normal, reach, origin=origin)
     lit &= may_see(light, frame.position, frame.geometric_normal, reach, origin=origin)
     texels = np.nonzero(lit)[0].astype(np.int32)
@@ -126,8 +126,8 @@ def _sampled(
     lift = offset[of_ray]
     points = frame.position[of_ray] + frame.geometric_normal[of_ray] * lift[:, None]
     if samples > 1:
-        x, y = (unit_float32(n).reshape(-1, 1) for n in stratified_pair(keys, samples, pair=2 * number, seed=seed))
-        points += (x - np.float32(0.5)) * frame.tangent_u[of_ray] + (y - np.float32(0.5)) * frame.tangent_v[of_ray]
+        x, _ = (unit_float32(n).reshape(-1) for n in stratified_pair(keys, samples, pair=2 * number, seed=seed))
+        points = frame.points[of_ray, (x * frame.points.shape[1]).astype(np.int64)]
     u, v = (unit_float32(n).reshape(-1) for n in stratified_pair(keys, samples, pair=2 * number + 1, seed=seed))
     view = view_lamp(light, points, u, v, origin=shadows.geometry.origin, nearest=lift, far=_far(shadows.geometry))
     cosine = dot(frame.normal[of_ray], view.direction)
@@ -151,4 +151,4 @@ def _far(geometry: Geometry) -> float:
 
 
 def _length(vectors: Float32) -> Float32:
-    return np.asarray(np.sqrt(dot(vectors, vectors)))
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))

@@ -21,12 +21,13 @@ from scipy import sparse
 from .geometry import Geometry
 from .parallel import CHUNK_RAYS, Workers
 from .patterns import bright_patterns, cosine_patterns, pattern_of_texels
+from .rasterise import POINTS
 from .sampling import frames, hash_keys, unit_float32
 from .scatter import ABSORBED, Surfaces, scatter
 from .scene import Bool, Float32, Float64, Int32
 from .settings import SampleCounts
 from .sky import Sky
-from .texels import TexelFrame, Texels
+from .texels import BACK, TexelFrame, Texels
 from .tracing import Hits, Tracer
 
 NO_TARGET = -1
@@ -126,7 +127,6 @@ class LinkTracer:
             [bright.probability[:count] / area, bright.probability[count:] / (sky.solid_angle if sky else 1)]
         ).astype(np.float32)
         self._tangents = frames(frame.normal)
-        self._lift = geometry.offset_length(frame.position)
 
     def trace(self, first: int, stop: int) -> TracedLinks:
         """The links of texels first..stop-1."""
@@ -142,19 +142,16 @@ class LinkTracer:
         row, beyond, throughput, cast = self._beyond(first, hits, columns[0].reshape(-1), directions)
         return TracedLinks(target, weight, usable, row, beyond, throughput, rays + cast)
 
-    def _starts(self, rows: slice, footprint: Float32) -> Float32:
-        """(m, c, 3) ray origins spread over each texel's footprint."""
-        f = self._frame
-        lifted = f.position[rows] + f.geometric_normal[rows] * self._lift[rows, None]
-        spread = footprint[:, :, :1] * f.tangent_u[rows, None] + footprint[:, :, 1:] * f.tangent_v[rows, None]
-        return np.asarray(spread + lifted[:, None], np.float32)
+    def _starts(self, rows: slice, start: Int32) -> Float32:
+        """(m, c, 3) ray origins: the points ``start`` (m, c) of each texel."""
+        return np.take_along_axis(self._frame.points[rows], start[:, :, None], axis=1)
 
     def _cosine(self, rows: slice, pattern: Int32) -> tuple[tuple[Int32, Float32, Bool], Hits, Float32]:
         table = cosine_patterns(self._samples.cosine, self._seed)
         local = table.directions[pattern]  # (m, c, 3)
         axes = np.stack([self._tangents[0][rows], self._tangents[1][rows], self._frame.normal[rows]], axis=1)
         directions = np.matmul(local, axes)  # (m, c, 3)
-        origins = self._starts(rows, table.footprint[pattern])
+        origins = self._starts(rows, table.start[pattern])
         shape = local.shape[:2]
         flat_directions = directions.reshape(-1, 3)
         hits = self._tracer.intersect(origins.reshape(-1, 3), flat_directions)
@@ -175,7 +172,7 @@ class LinkTracer:
         points, normals, target_table = self._aims()
         target = target_table[pattern]  # (m, b)
         is_sky = target >= self._texels.count
-        origins = self._starts(rows, table.footprint[pattern])
+        origins = self._starts(rows, table.start[pattern])
         ways = points[pattern] - np.where(is_sky[:, :, None], np.float32(0), origins)
         distance2 = np.einsum("mbj,mbj->mb", ways, ways)
         distance = np.sqrt(np.maximum(distance2, np.finfo(np.float32).tiny))
@@ -249,11 +246,10 @@ class LinkTracer:
             target = np.minimum(target, len(self._bright.probability) - 1).astype(np.int32)
             points, normals = np.zeros((len(target), 3), np.float32), np.zeros((len(target), 3), np.float32)
             solid = target < self._texels.count
-            t, on = target[solid], table.target.reshape(-1, 2)[solid] - np.float32(0.5)
-            f = self._frame
-            points[solid] = f.position[t] + f.tangent_u[t] * on[:, :1] + f.tangent_v[t] * on[:, 1:]
-            points[solid] += f.geometric_normal[t] * self._lift[t, None]
-            normals[solid] = f.geometric_normal[t]
+            t, on = target[solid], (table.target.reshape(-1, 2)[solid, 0] * POINTS).astype(np.int64)
+            points[solid] = self._frame.points[t, on]
+            facing = np.where(self._texels.side[t] == BACK, np.float32(-1), np.float32(1))
+            normals[solid] = self._geometry.normals[self._texels.point_triangle[t, on]] * facing[:, None]
             if self._sky is not None:
                 on = table.target.reshape(-1, 2)[~solid]
                 points[~solid] = self._sky.directions(target[~solid] - self._texels.count, on[:, 0], on[:, 1])

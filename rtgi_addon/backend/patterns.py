@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
+from .rasterise import POINTS
 from .sampling import hash_keys, sample_cosine_hemisphere, stratified_pair, unit_float32
 from .scene import Float32, Int32
 
@@ -23,7 +24,7 @@ class CosinePatterns:
     """P patterns of c rays."""
 
     directions: Float32  # (P, c, 3) cosine-distributed about +z
-    footprint: Float32  # (P, c, 2) where in the texel's footprint the ray starts, -1/2..1/2
+    start: Int32  # (P, c) which of the texel's points the ray starts from
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class BrightPatterns:
 
     choice: Float32  # (P, b) in [0, 1), stratified within a pattern
     target: Float32  # (P, b, 2) in [0, 1)
-    footprint: Float32  # (P, b, 2) -1/2..1/2
+    start: Int32  # (P, b) which of the texel's points the ray starts from
 
 
 @lru_cache(maxsize=8)
@@ -40,7 +41,7 @@ def cosine_patterns(count: int, seed: int) -> CosinePatterns:
     keys = np.arange(PATTERNS, dtype=np.uint32)
     u, v = (unit_float32(x).reshape(-1) for x in stratified_pair(keys, count, pair=0, seed=seed))
     directions = sample_cosine_hemisphere(u, v).astype(np.float32).reshape(PATTERNS, count, 3)
-    return CosinePatterns(directions, _footprint(keys, count, 1, seed))
+    return CosinePatterns(directions, _starts(keys, count, 1, seed))
 
 
 @lru_cache(maxsize=8)
@@ -49,12 +50,13 @@ def bright_patterns(count: int, seed: int) -> BrightPatterns:
     # A (0, 2)-sequence: the first half of the samples is stratified by itself, and so is the second.
     choice = unit_float32(stratified_pair(keys, count, pair=4, seed=seed)[0])
     on_target = np.stack([unit_float32(x) for x in stratified_pair(keys, count, pair=2, seed=seed)], axis=-1)
-    return BrightPatterns(choice, on_target.astype(np.float32), _footprint(keys, count, 3, seed))
+    return BrightPatterns(choice, on_target.astype(np.float32), _starts(keys, count, 3, seed))
 
 
-def _footprint(keys: np.ndarray, count: int, pair: int, seed: int) -> Float32:
-    halves = [unit_float32(x) - np.float32(0.5) for x in stratified_pair(keys, count, pair=pair, seed=seed)]
-    return np.stack(halves, axis=-1).astype(np.float32)
+def _starts(keys: np.ndarray, count: int, pair: int, seed: int) -> Int32:
+    """(P, count) points 0..POINTS-1, each as often as the others, in an order of its own for each pattern."""
+    spread = unit_float32(stratified_pair(keys, count, pair=pair, seed=seed)[0])
+    return (spread * POINTS).astype(np.int32)
 
 
 def pattern_of_texels(first: int, stop: int, seed: int) -> Int32:

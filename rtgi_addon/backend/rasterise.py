@@ -16,6 +16,10 @@ from .scene import Bool, Float32, Float64, Int32
 
 #: Sub-samples per pixel side for coverage: 1/16 of a pixel's area is the smallest share told apart.
 SUBSAMPLES = 4
+#: Points of the surface kept for each texel: where its rays start and what aimed samples aim at.
+POINTS = 8
+#: All sub-samples of a pixel in the order in which POINTS are picked: any first few are spread over the pixel.
+_SPREAD = np.array([0, 10, 7, 13, 2, 8, 5, 15, 11, 1, 12, 6, 9, 3, 14, 4])
 #: Candidate (triangle, pixel) pairs worked on at a time, to bound memory.
 CHUNK_PAIRS = 1 << 20
 #: A pixel that a triangle enters by less than this is not touched: rectangle borders meet the pixel grid by rounding.
@@ -35,7 +39,8 @@ class RasterTexels:
     triangle: Int32  # (n,) of the mesh: the one that stands for the pixel
     barycentric: Float32  # (n, 2) weights of its second and third corner at the texel's sample point
     coverage: Float32  # (n,) share of the pixel that is this island's surface, 0..1, never 0
-    extent: Float32  # (n, 2) size of the covered part along col and row, pixels
+    point_triangle: Int32  # (n, POINTS) points spread over the covered part: triangle of the mesh
+    point_barycentric: Float32  # (n, POINTS, 2) and weights of its second and third corner
     pair_texel: Int32  # (m,) texel and triangle of each overlap,
     pair_triangle: Int32  # (m,)
     pair_share: Float32  # (m,) and how much of the triangle's area lies there; sums to about one over a triangle
@@ -50,7 +55,8 @@ def rasterise(corner_px: Float64, island_of_triangle: Int32) -> RasterTexels:
     pairs = _covered_pairs(corner_px)
     if not len(pairs.triangle):
         none, nothing, no_pair = np.zeros(0, np.int32), np.zeros(0, np.float32), np.zeros((0, 2), np.float32)
-        return RasterTexels(none, none, none, no_pair, nothing, no_pair, none, none, nothing)
+        no_points = np.zeros((0, POINTS), np.int32), np.zeros((0, POINTS, 2), np.float32)
+        return RasterTexels(none, none, none, no_pair, nothing, *no_points, none, none, nothing)
     return _texels_of_pairs(pairs, corner_px, island_of_triangle)
 
 
@@ -61,10 +67,7 @@ class _Pairs:
     triangle: Int32
     col: Int32
     row: Int32
-    samples: Int32  # number of sub-samples covered, 0..16
-    sum_px: Float64  # (m, 2) sum of the covered sub-samples' coordinates
-    low: Float32  # (m, 2) smallest covered sub-sample coordinate within the pixel, 0..1
-    high: Float32
+    inside: Bool  # (m, 16) which sub-samples are covered
     nearest: Float64  # (m, 2) point of the triangle nearest to the pixel's centre
 
 
@@ -105,26 +108,21 @@ def _pairs_of(triangles: Int32, corner_px: Float64, low: Int32, size: Int32) -> 
     keep = ~outside
     triangle, pixel, inside_all = triangle[keep], pixel[keep], inside_all[keep]
     edges = [(nx[keep], ny[keep], offset[keep]) for nx, ny, offset in edges]
-    samples = np.full(len(triangle), SUBSAMPLES * SUBSAMPLES, np.int32)
-    sum_px = (pixel + 0.5) * samples[:, None]
-    lo, hi = np.zeros((len(triangle), 2), np.float32), np.ones((len(triangle), 2), np.float32)
+    inside = np.ones((len(triangle), SUBSAMPLES * SUBSAMPLES), np.bool_)
     nearest = pixel + 0.5
     part = np.nonzero(~inside_all)[0]
     if len(part):
         partial = [(nx[part], ny[part], offset[part]) for nx, ny, offset in edges]
-        samples[part], sum_px[part], lo[part], hi[part] = _subsample(pixel[part], partial)
+        inside[part] = _subsample(pixel[part], partial)
         tri = triangle[part]
         nearest[part] = _nearest_points(pixel[part] + 0.5, corner_px[tri, 0], corner_px[tri, 1], corner_px[tri, 2])
-    touches = (samples > 0) | (np.abs(nearest - pixel - 0.5).max(axis=1) <= 0.5 - TOUCH_PX)
+    touches = inside.any(axis=1) | (np.abs(nearest - pixel - 0.5).max(axis=1) <= 0.5 - TOUCH_PX)
     # A triangle that lies on a pixel border still needs a texel.
     first = triangles[0] if len(triangles) else 0
     lost = np.bincount(triangle[touches] - first, minlength=len(triangles)) == 0
     touches |= lost[triangle - first] & (np.diff(triangle, prepend=-1) != 0)
     col32, row32 = pixel[touches, 0].astype(np.int32), pixel[touches, 1].astype(np.int32)
-    return _Pairs(
-        triangle[touches].astype(np.int32), col32, row32, samples[touches], sum_px[touches],
-        lo[touches], hi[touches], nearest[touches],
-    )  # fmt: skip
+    return _Pairs(triangle[touches].astype(np.int32), col32, row32, inside[touches], nearest[touches])
 
 
 def _edge_functions(a: Float64, b: Float64, c: Float64) -> list[tuple[Float64, Float64, Float64]]:
@@ -138,24 +136,25 @@ def _edge_functions(a: Float64, b: Float64, c: Float64) -> list[tuple[Float64, F
     return edges
 
 
-def _subsample(
-    pixel: Float64, edges: list[tuple[Float64, Float64, Float64]]
-) -> tuple[Int32, Float64, Float32, Float32]:
-    """Count, coordinate sum and bounds of the sub-samples inside all edges."""
+def _subsample_offsets() -> Float64:
+    """(16, 2) sub-samples within a pixel, (col, row).
+
+    Slightly off the grid, differently in col and row: no sample lies on the edges that artists draw (45°, parallel to
+    an axis), where both neighbours would claim it.
+    """
     steps = (np.arange(SUBSAMPLES) + 0.5) / SUBSAMPLES
-    # Slightly off the grid, differently in x and y: no sample lies on the edges that artists draw (45°, axis-parallel),
-    # where both neighbours would claim it.
-    dx, dy = (g.ravel() for g in np.meshgrid(steps + 1.1e-3, steps - 0.7e-3))  # (16,)
+    col, row = np.meshgrid(steps + 1.1e-3, steps - 0.7e-3)
+    return np.stack([col.ravel(), row.ravel()], axis=1)
+
+
+def _subsample(pixel: Float64, edges: list[tuple[Float64, Float64, Float64]]) -> Bool:
+    """(m, 16) which sub-samples of each pixel lie inside all edges."""
+    dx, dy = _subsample_offsets().T
     inside = np.ones((len(pixel), len(dx)), np.bool_)
     for nx, ny, offset in edges:
         at = (nx * pixel[:, 0] + ny * pixel[:, 1] + offset)[:, None]
         inside &= at + nx[:, None] * dx + ny[:, None] * dy >= 0
-    count = inside.sum(axis=1).astype(np.int32)
-    sums = np.stack([inside @ dx, inside @ dy], axis=1) + count[:, None] * pixel
-    half = 0.5 / SUBSAMPLES
-    low = np.stack([np.where(inside, d, 1.0).min(axis=1) for d in (dx, dy)], axis=1) - half
-    high = np.stack([np.where(inside, d, 0.0).max(axis=1) for d in (dx, dy)], axis=1) + half
-    return count, sums, low.astype(np.float32), high.astype(np.float32)
+    return inside
 
 
 def _nearest_points(p: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
@@ -187,7 +186,8 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
     key_change = np.diff(pixel[by_island], prepend=-1) != 0
     island_change = key_change | (np.diff(island[by_island], prepend=-1) != 0)
     group = np.cumsum(island_change) - 1  # (m,) one a (pixel, island)
-    covered = np.bincount(group, weights=pairs.samples[by_island])
+    samples_of_pair = pairs.inside.sum(axis=1)
+    covered = np.bincount(group, weights=samples_of_pair[by_island])
     first = np.nonzero(island_change)[0]
     # Of a pixel's islands the one covering more wins; lexsort is stable, so ties go to the lower island.
     order = np.lexsort((np.arange(len(first)), -covered, pixel[by_island][first]))
@@ -199,29 +199,26 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
     texel = texel[texel >= 0]
     n = len(winner)
 
-    samples = np.bincount(texel, weights=pairs.samples[member], minlength=n)
+    samples = np.bincount(texel, weights=samples_of_pair[member], minlength=n)
     offset = pairs.nearest[member] - np.stack([pairs.col[member], pairs.row[member]], axis=1) - 0.5
     distance = np.einsum("ij,ij->i", offset, offset)
     nearest_first = np.lexsort((pairs.triangle[member], distance, texel))
     chosen = member[nearest_first[np.diff(texel[nearest_first], prepend=-1) != 0]]
+    pixels = np.stack([pairs.col[chosen], pairs.row[chosen]], axis=1).astype(np.float64)
 
-    low, high = np.ones((n, 2), np.float32), np.zeros((n, 2), np.float32)
-    np.minimum.at(low, texel, pairs.low[member])
-    np.maximum.at(high, texel, pairs.high[member])
-    centre = np.stack([np.bincount(texel, weights=pairs.sum_px[member, k], minlength=n) for k in (0, 1)], axis=1)
-    some = samples > 0
-    point = np.where(some[:, None], centre / np.maximum(samples, 1)[:, None], pairs.nearest[chosen])
-    whole = samples >= SUBSAMPLES * SUBSAMPLES
-    middle = np.stack([pairs.col[chosen], pairs.row[chosen]], axis=1) + 0.5
-    point[whole] = middle[whole]
-    low[whole], high[whole] = 0, 1
+    owner = np.full((n, SUBSAMPLES * SUBSAMPLES), -1, np.int32)  # triangle under each sub-sample
+    pair, at = np.nonzero(pairs.inside[member])
+    owner[texel[pair], at] = pairs.triangle[member][pair]
+    point = _middles(pixels, owner, pairs.nearest[chosen])
     corners = corner_px[pairs.triangle[chosen]]
     # The middle of the covered part may lie on a neighbour; the nearest point of the chosen triangle stands for it.
     point = _nearest_points(point, corners[:, 0], corners[:, 1], corners[:, 2])
+    barycentric = _barycentric(point, corners).astype(np.float32)
+    point_triangle, point_barycentric = _points(pixels, owner, corner_px, pairs.triangle[chosen], barycentric)
     smallest = 1.0 / (SUBSAMPLES * SUBSAMPLES)
     # A triangle between the sub-samples still has its area: it counts as a sliver of one. Small triangles' shares are
     # made to sum to one; large ones are left as counted, so that both sides of a shared edge fit together.
-    part = np.maximum(pairs.samples[member] * smallest, smallest * smallest)
+    part = np.maximum(samples_of_pair[member] * smallest, smallest * smallest)
     counted = np.bincount(pairs.triangle[member], weights=part, minlength=len(corner_px))
     exact = _pixel_areas(corner_px)
     of_triangle = np.where(exact >= LARGE_PX, exact, counted)
@@ -229,13 +226,42 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
         row=pairs.row[chosen],
         col=pairs.col[chosen],
         triangle=pairs.triangle[chosen],
-        barycentric=_barycentric(point, corners).astype(np.float32),
+        barycentric=barycentric,
         coverage=np.clip(samples * smallest, smallest, 1.0).astype(np.float32),
-        extent=np.where(some[:, None], high - low, 1.0 / SUBSAMPLES).astype(np.float32),
+        point_triangle=point_triangle,
+        point_barycentric=point_barycentric,
         pair_texel=texel.astype(np.int32),
         pair_triangle=pairs.triangle[member],
         pair_share=(part / of_triangle[pairs.triangle[member]]).astype(np.float32),
     )
+
+
+def _middles(pixels: Float64, owner: Int32, nearest: Float64) -> Float64:
+    """(n, 2) middle of the covered sub-samples; the pixel's centre where all are, ``nearest`` where none is."""
+    covered = owner >= 0
+    count = covered.sum(axis=1)
+    middle = pixels + (covered @ _subsample_offsets()) / np.maximum(count, 1)[:, None]
+    whole = count == owner.shape[1]
+    middle[whole] = pixels[whole] + 0.5
+    return np.where((count > 0)[:, None], middle, nearest)
+
+
+def _points(
+    pixels: Float64, owner: Int32, corner_px: Float64, triangle: Int32, barycentric: Float32
+) -> tuple[Int32, Float32]:
+    """((n, POINTS), (n, POINTS, 2)) triangle and weights of points over the covered sub-samples, repeated where there
+    are fewer; the texel's own ``triangle``, ``barycentric`` where there are none."""
+    spread = owner[:, _SPREAD]
+    covered_first = np.argsort(spread < 0, axis=1, kind="stable")
+    count = (spread >= 0).sum(axis=1)
+    turn = np.arange(POINTS)[None, :] % np.maximum(count, 1)[:, None]
+    sub = _SPREAD[np.take_along_axis(covered_first, turn, axis=1)]  # (n, POINTS)
+    found = np.take_along_axis(owner, sub, axis=1)
+    some = found >= 0
+    found = np.where(some, found, triangle[:, None])
+    place = pixels[:, None] + _subsample_offsets()[sub]
+    weights = _barycentric(place.reshape(-1, 2), corner_px[found.reshape(-1)]).reshape(*found.shape, 2)
+    return found.astype(np.int32), np.where(some[:, :, None], weights, barycentric[:, None]).astype(np.float32)
 
 
 def _pixel_areas(corner_px: Float64) -> Float64:
@@ -254,14 +280,3 @@ def _barycentric(point: Float64, corners: Float64) -> Float64:
     u, v = np.clip(u, 0, 1), np.clip(v, 0, 1)
     over = np.maximum(u + v, 1.0)
     return np.stack([u / over, v / over], axis=1)
-
-
-def pixel_derivatives(corner_px: Float64) -> tuple[Float32, Bool]:
-    """((t, 2, 2), (t,)): [k] is the change of barycentric weight k + 1 for a step of one pixel in (col, row),
-    zero for triangles flat in the map; and which are not flat."""
-    e1, e2 = corner_px[:, 1] - corner_px[:, 0], corner_px[:, 2] - corner_px[:, 0]
-    det = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
-    good = np.abs(det) > FLAT_AREA_PX
-    inverse = np.stack([np.stack([e2[:, 1], -e2[:, 0]], axis=1), np.stack([-e1[:, 1], e1[:, 0]], axis=1)], axis=1)
-    safe = np.where(good, det, 1.0)[:, None, None]
-    return np.where(good[:, None, None], inverse / safe, 0.0).astype(np.float32), good

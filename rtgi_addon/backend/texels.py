@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 
 from .geometry import Geometry, unit
-from .rasterise import RasterTexels, pixel_derivatives, rasterise
+from .rasterise import POINTS, RasterTexels, rasterise
 from .scene import Atlas, Bool, Float32, Float64, Int32, Material, Mesh, Placement, Scene
 
 FRONT, BACK = 0, 1
@@ -38,7 +38,8 @@ class Texels:
     surface_count: int
     triangle: Int32  # (n,) scene-wide
     barycentric: Float32  # (n, 2) weights of the triangle's second and third corner
-    derivative: Float32  # (n, 2, 2) change of those weights per pixel in (col, row), shrunk to the covered part
+    point_triangle: Int32  # (n, POINTS) points spread over the texel's surface, see ``rasterise``: scene-wide triangle
+    point_barycentric: Float32  # (n, POINTS, 2)
     coverage: Float32  # (n,) share of the pixel that is surface
     share: sparse.csr_matrix  # (n, triangles) part of each triangle's area that is the texel's
     index: Int32  # (pages, H, W) texel of each pixel, -1 where there is none
@@ -82,8 +83,7 @@ class TexelFrame:
     position: Float32  # (n, 3)
     normal: Float32  # (n, 3) unit shading normal, out of the texel's own side
     geometric_normal: Float32  # (n, 3) unit, out of the texel's own side
-    tangent_u: Float32  # (n, 3) m: the footprint's extent along col
-    tangent_v: Float32  # (n, 3) m: ... along row
+    points: Float32  # (n, POINTS, 3) spread over the texel's surface, lifted off it: where rays start and end
     area: Float32  # (n,) m²
 
 
@@ -112,8 +112,7 @@ def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
             affine[rows] = _affine(corner_px)
             page_start[rows] = placement.page * atlas.resolution**2
             raster = rasters[key]
-            derivative = _footprint_derivative(start, raster)
-            parts.append(_Side(number, side, placement.page, whole, triangles.start, surface_count, raster, derivative))
+            parts.append(_Side(number, side, placement.page, whole, triangles.start, surface_count, raster))
             surface_count += mesh.island_count
     columns, share = _columns(scene, parts, geometry.triangle_count)
     return _on_pages(columns, share, atlas, surface_count, affine, page_start)
@@ -130,7 +129,6 @@ class _Side:
     first_triangle: int
     first_surface: int
     raster: RasterTexels
-    derivative: Float32  # (n, 2, 2)
 
 
 def _corner_px(mesh: Mesh, placement: Placement, resolution: int) -> Float64:
@@ -141,12 +139,6 @@ def _corner_px(mesh: Mesh, placement: Placement, resolution: int) -> Float64:
 def _affine(corner_px: Float64) -> Float64:
     origin = corner_px[:, 0]
     return np.stack([origin, corner_px[:, 1] - origin, corner_px[:, 2] - origin], axis=1)
-
-
-def _footprint_derivative(corner_px: Float64, raster: RasterTexels) -> Float32:
-    """(n, 2, 2) change of barycentric weights per pixel; a partly covered pixel's footprint is its covered part."""
-    derivative, _ = pixel_derivatives(corner_px)
-    return np.asarray(derivative[raster.triangle] * raster.extent[:, None, :], np.float32)
 
 
 def _columns(
@@ -174,7 +166,8 @@ def _columns(
         ).astype(np.int32),
         "triangle": joined(lambda p: p.raster.triangle + p.first_triangle, (), np.int32),
         "barycentric": joined(lambda p: p.raster.barycentric, (2,), np.float32),
-        "derivative": joined(lambda p: p.derivative, (2, 2), np.float32),
+        "point_triangle": joined(lambda p: p.raster.point_triangle + p.first_triangle, (POINTS,), np.int32),
+        "point_barycentric": joined(lambda p: p.raster.point_barycentric, (POINTS, 2), np.float32),
         "coverage": joined(lambda p: p.raster.coverage, (), np.float32),
     }
     texel = [p.raster.pair_texel + int(start) for p, start in zip(parts, starts, strict=False)]
@@ -238,17 +231,23 @@ def place_texels(texels: Texels, geometry: Geometry) -> TexelFrame:
     # No shading normal (it vanished between opposite corners, or the mesh has none): the triangle's own.
     lost = np.einsum("ij,ij->i", normal, normal) < 0.5
     normal[lost] = geometric[lost]
-    step = texels.derivative
-    tangent_u = e1 * step[:, 0, :1] + e2 * step[:, 1, :1]
-    tangent_v = e1 * step[:, 0, 1:] + e2 * step[:, 1, 1:]
     return TexelFrame(
         position=corners[:, 0] + e1 * u + e2 * v,
         normal=(normal * facing).astype(np.float32),
         geometric_normal=geometric * facing,
-        tangent_u=tangent_u.astype(np.float32),
-        tangent_v=tangent_v.astype(np.float32),
+        points=_lifted_points(texels, geometry),
         area=np.asarray(texels.share @ triangle_areas(geometry), np.float32),
     )
+
+
+def _lifted_points(texels: Texels, geometry: Geometry) -> Float32:
+    """(n, POINTS, 3) each point lifted off its own triangle, to the texel's side."""
+    triangle = texels.point_triangle.reshape(-1)
+    u, v = texels.point_barycentric.reshape(-1, 2).T
+    points = geometry.points(triangle, u, v)
+    facing = np.where(texels.side == BACK, np.float32(-1), np.float32(1)).repeat(POINTS)
+    lift = (geometry.offset_length(points) * facing)[:, None]
+    return np.asarray(points + geometry.normals.take(triangle, axis=0) * lift, np.float32).reshape(-1, POINTS, 3)
 
 
 def triangle_areas(geometry: Geometry) -> Float32:

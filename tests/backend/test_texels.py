@@ -92,7 +92,7 @@ def test_a_side_without_map_gives_no_texel():
     assert texels.of_hits(*hit, np.array([True, False])).tolist() == [-1, -1]
 
 
-def test_positions_follow_the_instance_and_footprints_span_a_texel():
+def test_positions_follow_the_instance_and_points_span_a_texel():
     matrix = np.diag([2.0, 3.0, 1.0, 1.0])
     matrix[:3, 3] = 5, 6, 7
     scene, atlas = one(scenes.quad("sheet", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]), matrix, size=(4, 4))
@@ -101,8 +101,8 @@ def test_positions_follow_the_instance_and_footprints_span_a_texel():
     low = texels.col.min(), texels.row.min()
     expected = np.stack([5 + (texels.col - low[0] + 0.5) / 2, 6 + (texels.row - low[1] + 0.5) * 0.75], axis=1)
     np.testing.assert_allclose(world[:, :2], expected, atol=1e-5)
-    np.testing.assert_allclose(frame.tangent_u, [[0.5, 0, 0]] * 16, atol=1e-5)
-    np.testing.assert_allclose(frame.tangent_v, [[0, 0.75, 0]] * 16, atol=1e-5)
+    assert np.ptp(frame.points[:, :, 0], axis=1) == pytest.approx(0.375, abs=1e-4)
+    assert np.ptp(frame.points[:, :, 1], axis=1) == pytest.approx(0.5625, abs=1e-4)
     np.testing.assert_allclose(frame.area, 0.375, rtol=1e-4)
 
 
