@@ -36,6 +36,9 @@ class SourceScene:
     lights: tuple[Light, ...]
     world: World | None
     warnings: tuple[str, ...] = ()
+    keys: tuple[tuple[str | int, ...], ...] = ()  # what finds each instance again in another frame
+    first_frames: tuple[int, ...] = ()  # by instance: where it is first seen
+    lit: bool = True  # a lamp or the sky gives light in some frame
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,87 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One frame's state, read after the caller has set the frame: matrices, deformed vertices, lamps, sky, materials.
+
+Topology and textures are in the SourceScene already; only what moves is read again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import bpy
+import numpy as np
+
+from ..backend.errors import BakeError
+from ..backend.scene import Bool, Float32, Float64, FrameState, Light, Material
+from ..source import SourceScene
+from . import lights, materials, world
+from .as_rendered import read_as_rendered
+from .meshes import loop_normals, positions
+from .placed import Placed, placed_meshes
+
+
+@dataclass
+class Reading:
+    """What one visit to the depsgraph fills."""
+
+    matrix: Float64  # (n, 4, 4)
+    visible: Bool  # (n,)
+    vertices: dict[int, Float32] = field(default_factory=dict)
+    corner_normals: dict[int, Float32] = field(default_factory=dict)
+    lamps: tuple[Light, ...] = ()
+
+
+def frame_state(source: SourceScene, frame: int, *, constants: Sequence[Material] | None = None) -> FrameState:
+    """The context's scene at ``frame``, which must be its current one.
+
+    ``constants`` are the materials of the first frame (``Appearance.materials``); with them, those that are animated
+    are evaluated anew.
+    """
+    scene = bpy.context.scene
+    if scene.frame_current != frame:
+        raise ValueError(f"the scene is at frame {scene.frame_current}, not {frame}: set the frame first")
+    reading = read_as_rendered(scene, bpy.context.view_layer, lambda depsgraph: _read(depsgraph, source, frame))
+    sky = world.evaluate_world(scene.world, _told_already) if world.is_animated(scene.world) else source.world
+    return FrameState(
+        frame=frame,
+        matrix_world=reading.matrix,
+        visible=reading.visible,
+        lights=reading.lamps,
+        world=sky,
+        vertices=reading.vertices,
+        corner_normals=reading.corner_normals,
+        materials=None if constants is None else materials.animated_constants(source, constants),
+    )
+
+
+def _told_already(_line: str) -> None:
+    """extract_source visited this frame and kept its warnings."""
+
+
+def _read(depsgraph: bpy.types.Depsgraph, source: SourceScene, frame: int) -> Reading:
+    index_of = {key: index for index, key in enumerate(source.keys)}
+    still = np.array([i.matrix_world for i in source.instances], np.float64).reshape(-1, 4, 4)
+    reading = Reading(still, np.zeros(len(still), np.bool_))
+    for placed in placed_meshes(depsgraph, _told_already):
+        index = index_of.get(placed.key)
+        if index is None:
+            raise BakeError(f"{placed.name}: appears in frame {frame}, which the bake was not told of; bake it again")
+        reading.matrix[index] = placed.matrix
+        reading.visible[index] = True
+        instance = source.instances[index]
+        if instance.deforming and instance.mesh not in reading.vertices:
+            _read_deformed(placed, source, instance.mesh, frame, reading)
+    reading.lamps = lights.lights_of(depsgraph, _told_already)
+    return reading
+
+
+def _read_deformed(placed: Placed, source: SourceScene, mesh: int, frame: int, reading: Reading) -> None:
+    known, vertices = source.meshes[mesh], positions(placed.data)
+    if len(vertices) != len(known.vertices) or len(placed.data.loops) <= known.loop_of_corner.max(initial=-1):
+        raise BakeError(
+            f"{placed.name}: has other faces in frame {frame} than at first; apply or freeze what changes them"
+        )
+    # Vertices that are not finite in any frame belong to no triangle.
+    reading.vertices[mesh] = np.nan_to_num(vertices, posinf=0, neginf=0)
+    reading.corner_normals[mesh] = np.nan_to_num(loop_normals(placed.data)[known.loop_of_corner])

@@ -1,0 +1,203 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The user's scene over the frames of a bake: which meshes there are, who uses them, what moves and what deforms.
+
+Every frame is visited once, since only that tells a mover from a still object and finds meshes whose faces change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import bpy
+import numpy as np
+
+from ..backend.errors import BakeError
+from ..backend.progress import Report
+from ..backend.scene import Bool, Instance, Light, World
+from ..source import SourceMesh, SourceScene
+from . import lights, world
+from .as_rendered import read_as_rendered
+from .meshes import MeshArrays, positions, read_mesh, topology_digest, without_vertices
+from .placed import Key, Placed, placed_meshes
+from .stepping import frame_kept
+
+#: What one instance uses in one frame: the number of an evaluated mesh of that frame.
+MeshUse = int
+
+
+@dataclass
+class Seen:
+    """One instance over the frames."""
+
+    first: Placed
+    uses: dict[int, MeshUse] = field(default_factory=dict)  # by frame
+    moving: bool = False
+
+
+@dataclass
+class Census:
+    """All that the visits to the frames found."""
+
+    warnings: list[str] = field(default_factory=list)
+    seen: dict[Key, Seen] = field(default_factory=dict)
+    arrays: dict[tuple[int, MeshUse], MeshArrays] = field(default_factory=dict)  # where an instance is first met
+    digest: dict[tuple[int, MeshUse], tuple[bytes, bytes]] = field(default_factory=dict)  # topology, vertices
+    bad: dict[tuple[int, MeshUse], Bool] = field(default_factory=dict)  # non-finite vertices
+    lamps: dict[int, tuple[Light, ...]] = field(default_factory=dict)  # by frame
+    lit: bool = False  # by a lamp or the sky, in any frame
+
+    def warn(self, line: str) -> None:
+        if line not in self.warnings:
+            self.warnings.append(line)
+
+
+def extract_source(frames: Sequence[int], report: Report) -> SourceScene:
+    """The context's scene as a render over ``frames`` would see it, positions as in the first frame.
+
+    Steps through the frames in order (so that simulations and frame handlers run) and goes back to the frame it found.
+    """
+    if not frames:
+        raise ValueError("extract_source needs at least one frame")
+    scene, view_layer = bpy.context.scene, bpy.context.view_layer
+    census, worlds = Census(), None
+    with frame_kept(scene):
+        for done, frame in enumerate(frames):
+            report("extract", done, len(frames))
+            scene.frame_set(frame)
+            read_as_rendered(scene, view_layer, lambda depsgraph, at=frame: _visit(depsgraph, at, census))
+            if done == 0 or world.is_animated(scene.world):
+                sky = world.evaluate_world(scene.world, census.warn)
+                worlds = sky if done == 0 else worlds
+                census.lit |= sky is not None and not sky.is_black
+    if not census.seen:
+        raise BakeError(
+            f"scene {scene.name}: nothing to bake, no mesh, curve, text or metaball is visible in a render; "
+            "add one or enable it for rendering"
+        )
+    source = _assemble(census, frames, worlds)
+    report("extract", len(frames), len(frames))
+    return source
+
+
+def _visit(depsgraph: bpy.types.Depsgraph, frame: int, census: Census) -> None:
+    number_of: dict[int, MeshUse] = {}  # by address: evaluated meshes live as long as this visit
+    for placed in placed_meshes(depsgraph, census.warn):
+        address = placed.data.as_pointer()
+        use = number_of.setdefault(address, len(number_of))
+        if (frame, use) not in census.digest:
+            _examine(placed, (frame, use), census)
+        known = census.seen.get(placed.key)
+        if known is None:
+            known = census.seen[placed.key] = Seen(replace(placed, data=None, object=None))
+            if (frame, use) not in census.arrays:
+                census.arrays[frame, use] = read_mesh(placed.data, placed.name, warn=census.warn)
+        else:
+            known.moving |= not np.array_equal(known.first.matrix, placed.matrix)
+            _check_same_faces(known, placed, frame, census.digest, use)
+        known.uses[frame] = use
+    census.lamps[frame] = lights.lights_of(depsgraph, census.warn)
+    census.lit |= any(max(lamp.power) > 0 for lamp in census.lamps[frame])
+
+
+def _examine(placed: Placed, at: tuple[int, MeshUse], census: Census) -> None:
+    vertices = positions(placed.data)
+    census.digest[at] = (topology_digest(placed.data), vertices.tobytes())
+    finite = np.isfinite(vertices).all(axis=1)
+    if not finite.all():
+        census.bad[at] = ~finite
+
+
+def _check_same_faces(
+    known: Seen, placed: Placed, frame: int, digest: dict[tuple[int, MeshUse], tuple[bytes, bytes]], use: MeshUse
+) -> None:
+    first = next(iter(known.uses.items()))
+    if digest[first][0] != digest[frame, use][0]:
+        raise BakeError(
+            f"{placed.name}: its faces change between frame {first[0]} and frame {frame}; apply or freeze the modifier "
+            "or shape that adds or removes faces, or bake the frames before and after apart"
+        )
+
+
+def _assemble(census: Census, frames: Sequence[int], sky: World | None) -> SourceScene:
+    """Instances that use the same mesh with the same materials in every frame share a SourceMesh."""
+    names = unique_names([s.first.name for s in census.seen.values()])
+    material_index: dict[str | None, int] = {}
+    mesh_index: dict[tuple[object, ...], int] = {}
+    meshes: list[SourceMesh] = []
+    instances: list[Instance] = []
+    for name, seen in zip(names, census.seen.values(), strict=True):
+        group = (tuple(sorted(seen.uses.items())), seen.first.materials)
+        if group not in mesh_index:
+            mesh_index[group] = len(meshes)
+            meshes.append(_source_mesh(seen, census, material_index))
+        vertices = {census.digest[at][1] for at in seen.uses.items()}
+        instances.append(
+            Instance(
+                name=name,
+                mesh=mesh_index[group],
+                matrix_world=seen.first.matrix,
+                moving=seen.moving or len(seen.uses) < len(set(frames)),
+                deforming=len(vertices) > 1,
+                blocks_light=seen.first.blocks_light,
+                receives_light=seen.first.receives_light,
+            )
+        )
+    _require_faces(meshes)
+    return SourceScene(
+        meshes=tuple(meshes),
+        instances=tuple(instances),
+        material_names=tuple(material_index),
+        lights=census.lamps[frames[0]],
+        world=sky,
+        warnings=tuple(census.warnings),
+        keys=tuple(census.seen),
+        first_frames=tuple(next(iter(seen.uses)) for seen in census.seen.values()),
+        lit=census.lit,
+    )
+
+
+def _source_mesh(seen: Seen, census: Census, material_index: dict[str | None, int]) -> SourceMesh:
+    arrays = census.arrays[next(iter(seen.uses.items()))]
+    bad = np.zeros(len(arrays.vertices), np.bool_)
+    for at in seen.uses.items():
+        bad |= census.bad.get(at, False)
+    if bad.any():
+        before = len(arrays.triangles)
+        arrays = without_vertices(arrays, bad)
+        census.warn(
+            f"{seen.first.name}: {int(bad.sum())} of its vertices are not finite; the {before - len(arrays.triangles)} "
+            "triangles at them are left out"
+        )
+    slots = seen.first.materials or (None,)
+    number = np.array([material_index.setdefault(name, len(material_index)) for name in slots], np.int32)
+    return SourceMesh(
+        name=seen.first.name,
+        vertices=arrays.vertices,
+        triangles=arrays.triangles,
+        corner_normals=arrays.corner_normals,
+        loop_of_corner=arrays.loop_of_corner,
+        polygon_of_triangle=arrays.polygon_of_triangle,
+        material_of_triangle=number[arrays.slot_of_triangle],
+        rtgi_uv=arrays.rtgi_uv,
+    )
+
+
+def _require_faces(meshes: Sequence[SourceMesh]) -> None:
+    if not any(len(mesh.triangles) for mesh in meshes):
+        raise BakeError("nothing to bake: no face of any object has finite vertices; repair or replace the meshes")
+
+
+def unique_names(names: Sequence[str]) -> list[str]:
+    """``names`` with "#2", "#3" ... after those that came before."""
+    count: dict[str, int] = {}
+    taken = set(names)
+    out = []
+    for name in names:
+        count[name] = count.get(name, 0) + 1
+        unique = name
+        while count[name] > 1 and (unique := f"{name}#{count[name]}") in taken:
+            count[name] += 1
+        taken.add(unique)
+        out.append(unique)
+    return out
