@@ -24,6 +24,9 @@ Rows = NDArray[np.int64]
 #: Within so many texel widths the count of texels says little about the area, and the disk is taken as it is.
 _DISK_TEXELS = 1.5
 
+#: The k photons of an estimate span at least this share of their texel.
+_LEAST_SHARE_OF_TEXEL = 1e-4
+
 
 @dataclass(frozen=True)
 class PhotonMap:
@@ -98,8 +101,8 @@ def _nearest(
     radius = distance[:, -1]
     flux = photons.flux.astype(np.float64)[nearest[:, :-1]].sum(axis=1)
     area = _spanned_area(texels, frame, workers, rows, surface_area, radius, apart)
-    # All k photons in one point span nothing; the texel's own area is the least there is.
-    least = np.maximum(frame.area[rows], np.finfo(np.float32).tiny)
+    # k photons in one point span nothing; a texel thick with photons may have its k within a small part of it.
+    least = np.maximum(frame.area[rows] * _LEAST_SHARE_OF_TEXEL, np.finfo(np.float32).tiny)
     return np.asarray(flux / np.maximum(area, least)[:, None], np.float32)
 
 
