@@ -29,6 +29,9 @@ from .tracing import EmbreeTracer, Hits, Tracer
 #: Rays of all sides together, and of one side at least and at most (powers of two).
 TOTAL_RAYS = 1 << 18
 RAYS_OF_SIDE = (128, 1024)
+#: Rays over all states together, about, and the states that are looked at whatever it costs.
+MOST_RAYS = 1 << 22
+LEAST_STATES = 16
 #: Segments of a path that looks for light. Each loses about the albedo, so light found later would hardly show.
 PATH_SEGMENTS = 8
 #: Lamps tested at one point; neighbouring points test the next ones.
@@ -46,21 +49,48 @@ FRONT, BACK = 0, 1
 def lit_sides(scene: Scene, states: Sequence[FrameState], *, workers: Workers | None = None) -> tuple[Bool, Bool]:
     """(n,), (n,) for each instance: can light reach its front, its back, in any of ``states``?
 
-    An emissive surface counts as lit on both sides: it must be in the maps to send its light.
+    An emissive surface counts as lit on both sides: it must be in the maps to send its light. Of very many states in
+    large scenes some are left out, evenly; states that differ in nothing that matters are looked at once.
     """
     own_workers = Workers() if workers is None else workers
-    count = len(scene.instances)
-    lit = np.zeros(2 * count, np.bool_)
+    lit = np.zeros(2 * len(scene.instances), np.bool_)
     try:
-        geometry = Geometry(scene, states[0])
-        tracer = EmbreeTracer(scene, geometry, states[0], own_workers)
-        for state in states:
+        first = last = states[0]
+        geometry = Geometry(scene, first)
+        tracer = EmbreeTracer(scene, geometry, first, own_workers)
+        for index in _tested_states(len(states), len(lit)):
+            state = states[index] if index else first
+            if index and not _differ(last, state):
+                continue
             tracer.update(state, geometry.update(state))
             lit |= _lit_in(_Setting(scene, state, geometry, tracer), lit)
+            last = state
     finally:
         if workers is None:
             own_workers.close()
     return lit[0::2], lit[1::2]
+
+
+def _tested_states(states: int, sides: int) -> list[int]:
+    """Indices of the states to look at: all that MOST_RAYS allows, the first and the last among them."""
+    most = max(LEAST_STATES, MOST_RAYS // (max(sides, 1) * RAYS_OF_SIDE[0]))
+    return sorted({round(i) for i in np.linspace(0, states - 1, min(states, most)).tolist()})
+
+
+def _differ(a: FrameState, b: FrameState) -> bool:
+    """May light reach other places in ``b`` than in ``a``? How strong it is does not matter."""
+    still = np.array_equal(a.matrix_world, b.matrix_world) and np.array_equal(a.visible, b.visible)
+    if not still or b.vertices or (a.world is None or a.world.is_black) != (b.world is None or b.world.is_black):
+        return True
+    if a.materials != b.materials or len(a.lights) != len(b.lights):
+        return True
+    return any(_reach(x) != _reach(y) for x, y in zip(a.lights, b.lights, strict=True))
+
+
+def _reach(light: Light) -> tuple[object, ...]:
+    """All of ``light`` that decides what it can light."""
+    shape = (light.kind, light.radius, light.angle, light.cone, light.size, light.shape, light.spread)
+    return (*shape, light.casts_shadow, is_dark(light), light.matrix_world.tobytes())
 
 
 class _Setting:
@@ -102,14 +132,15 @@ class _Rays:
 
 
 def _lit_in(setting: _Setting, known: Bool) -> Bool:
-    """(2n,) sides that light is found for; sides ``known`` to be lit are not searched for again."""
-    lit = np.zeros(len(known), np.bool_)
+    """(2n,) sides ``known`` to be lit, and those that light is found for in this state."""
+    lit = known.copy()
     emitting = setting.geometry.instance_of_triangle[setting.emits]
     lit[2 * emitting] = lit[2 * emitting + 1] = True
     start = _first_rays(setting)
+    start = start[~lit[start.side]]
     hits = setting.tracer.intersect(start.origin, start.direction)
     lit[start.side[_finds_light(setting, start, hits)]] = True
-    doubtful = _grouped_with(setting, start, hits, lit) & ~lit & ~known
+    doubtful = _grouped_with(setting, start, hits, lit) & ~lit
     count = int(doubtful[start.side].sum())
     for search in range(min(SEARCHES, -(-TOTAL_RAYS // max(count, 1))) if count else 0):
         rays = start[(doubtful & ~lit)[start.side]]

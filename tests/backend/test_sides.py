@@ -181,6 +181,27 @@ def test_states_are_united() -> None:
     assert front.tolist() == [True, True, True] and not back.any()
 
 
+def test_lamp_that_is_lit_in_one_frame_of_many() -> None:
+    """States that differ only in a lamp's being dark are told apart, however many there are."""
+    scene = make((plane(), np.eye(4)), lights=(point_light((0, 0, 1), 0.0),))
+    dark = scene.first_frame()
+    lit = replace(dark, lights=(point_light((0, 0, 1), 0.1),))
+    front, back = lit_sides(scene, [dark] * 77 + [lit] + [dark] * 122)
+    assert front.tolist() == [True] and back.tolist() == [False]
+
+
+def test_unchanging_states_cost_nothing() -> None:
+    """Only a lamp's power changes: one look is enough, and later states are read but not traced."""
+    scene, _ = cornell()
+    state = scene.first_frame()
+    states = [replace(state, lights=(point_light((0, 0, 1.9), 1.0 + i),)) for i in range(200)]
+    start = time.process_time()
+    one = lit_sides(scene, states[:1])
+    middle = time.process_time()
+    assert np.array_equal(one, lit_sides(scene, states))
+    assert time.process_time() - middle < 3 * (middle - start) + 0.1
+
+
 def test_light_through_a_small_window() -> None:
     """A room whose ceiling has a hole of 0.2 m; sun through it meets the floor, the walls see it from there."""
     h, g = 2.0, 0.1
