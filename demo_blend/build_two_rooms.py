@@ -11,6 +11,7 @@ import bpy
 import numpy as np
 from kit import (
     FRAMES,
+    add_ball,
     add_boxes,
     add_camera,
     add_mesh,
@@ -103,19 +104,6 @@ def add_furniture(left: float, right: float, oak: bpy.types.Material) -> None:
     bench.append(((0.45, -0.18, 0), (0.55, 0.18, 0.38)))
     place(add_boxes("Bench", bench, oak), (right - 0.7, -0.65, 0), turn=-15)
     place(add_ball("Ball", 0.3, diffuse("Chalk", (0.8, 0.79, 0.77))), (right + 0.35, 0.4, 1.1))
-
-
-def add_ball(name: str, radius: float, material: bpy.types.Material) -> bpy.types.Object:
-    around, up = 32, 16
-    phi, theta = np.meshgrid(np.arange(around) * 2 * np.pi / around, np.arange(1, up) * np.pi / up)
-    ring = np.stack([np.sin(theta) * np.cos(phi), np.sin(theta) * np.sin(phi), np.cos(theta)], -1).reshape(-1, 3)
-    i, j = np.meshgrid(np.arange(up - 2), np.arange(around), indexing="ij")
-    a, b = (i * around + j).ravel(), (i * around + (j + 1) % around).ravel()
-    quads = np.stack([a, a + around, b + around, b], -1).tolist()
-    first = np.arange(around)
-    north, south, base = len(ring), len(ring) + 1, (up - 2) * around
-    caps = [(north, k, (k + 1) % around) for k in first] + [(south, base + (k + 1) % around, base + k) for k in first]
-    return add_mesh(name, np.concatenate([ring, [(0, 0, 1), (0, 0, -1)]]) * radius, quads + caps, material, smooth=True)
 
 
 if __name__ == "__main__":

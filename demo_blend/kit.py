@@ -104,6 +104,44 @@ def add_boxes(
     return add_mesh(name, vertices, faces, *materials, slots=None if slots is None else np.repeat(slots, 6))
 
 
+def add_lathe(
+    name: str,
+    profile: Sequence[tuple[float, float]],
+    material: bpy.types.Material,
+    *,
+    around: int = 32,
+    smooth: bool = True,
+) -> bpy.types.Object:
+    """A profile of (radius, z) from top to bottom turned about z; it faces outward. Radius 0 at an end closes it."""
+    closed_top, closed_end = profile[0][0] == 0, profile[-1][0] == 0
+    rings = profile[int(closed_top) : len(profile) - int(closed_end)]
+    phi = np.arange(around) * 2 * np.pi / around
+    circle = np.stack([np.cos(phi), np.sin(phi), np.zeros(around)], -1)
+    vertices = np.concatenate([circle * radius + (0, 0, z) for radius, z in rings])
+    i, j = np.meshgrid(np.arange(len(rings) - 1) * around, np.arange(around), indexing="ij")
+    a, b = (i + j).ravel(), (i + (j + 1) % around).ravel()
+    faces = np.stack([a, a + around, b + around, b], -1).tolist()
+    for closed, point, first, step in (
+        (closed_top, profile[0], 0, 1),
+        (closed_end, profile[-1], (len(rings) - 1) * around, -1),
+    ):
+        if closed:
+            edges = [(first + k, first + (k + 1) % around)[::step] for k in range(around)]
+            faces += [(len(vertices), *edge) for edge in edges]
+            vertices = np.concatenate([vertices, [(0, 0, point[1])]])
+    return add_mesh(name, vertices, faces, material, smooth=smooth)
+
+
+def add_ball(name: str, radius: float, material: bpy.types.Material, *, around: int = 32) -> bpy.types.Object:
+    theta = np.linspace(0, np.pi, around // 2 + 1)
+    profile = [
+        (0.0, radius),
+        *zip(radius * np.sin(theta[1:-1]), radius * np.cos(theta[1:-1]), strict=True),
+        (0.0, -radius),
+    ]
+    return add_lathe(name, profile, material, around=around)
+
+
 def add_point_light(
     name: str, location: Sequence[float], watts: float, *, colour: Colour = (1.0, 1.0, 1.0), radius: float = 0.05
 ) -> bpy.types.Object:
