@@ -154,7 +154,7 @@ def trace_caustics(
 
 def caustic_irradiance(paths: PhotonPaths, texels: Texels, frame: TexelFrame, workers: Workers, *, k: int) -> Float32:
     """(n, 3) W/m² at each texel, from the hits of ``paths`` after their first mirror or glass."""
-    photons = make_photon_map(paths, texels, caustic_hits(paths))
+    photons = make_photon_map(paths, caustic_hits(paths))
     return photon_irradiance(photons, texels, frame, workers, k=k)
 
 
