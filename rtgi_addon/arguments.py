@@ -142,7 +142,7 @@ def _add_setting(group: Any, f: Field[Any], hint: Any) -> None:
 
 def _choices(hint: Any) -> list[str]:
     """The words an enumerated setting takes; none for numbers."""
-    return [str(word) for word in hint] if isinstance(hint, EnumType) else []
+    return list(map(str, hint.__members__.values())) if isinstance(hint, EnumType) else []
 
 
 def settings_of(arguments: argparse.Namespace) -> BakeSettings:

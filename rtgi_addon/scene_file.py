@@ -12,21 +12,21 @@ from pathlib import Path
 import bpy
 
 from .backend.errors import BakeError
+from .extract.nodes import reachable, uses_nodes
 
 #: Modifiers whose result depends on the frame though nothing has an animation curve.
 TIME_MODIFIERS = {
     "CLOTH", "COLLISION", "DYNAMIC_PAINT", "EXPLODE", "FLUID", "MESH_CACHE", "MESH_SEQUENCE_CACHE", "OCEAN",
     "PARTICLE_SYSTEM", "SOFT_BODY", "WAVE",
 }  # fmt: skip
+MATERIAL_OUTPUT, WORLD_OUTPUT = "ShaderNodeOutputMaterial", "ShaderNodeOutputWorld"
 #: Nodes that read the frame number, or carry state from frame to frame.
 TIME_NODES = {"GeometryNodeInputSceneTime", "GeometryNodeSimulationOutput"}
 
 
 def open_blend(path: Path | None) -> None:
-    """Make the file at ``path`` the open one; None keeps what Blender opened itself."""
+    """Make the file at ``path`` the open one; None keeps what is open."""
     if path is None:
-        if not bpy.data.filepath:
-            raise BakeError("no scene: no saved .blend is open, or the one named does not exist; name a .blend file")
         return
     if bpy.data.filepath and Path(bpy.data.filepath).absolute() == path:
         return
@@ -38,6 +38,12 @@ def open_blend(path: Path | None) -> None:
     except RuntimeError as fault:
         reason = str(fault).strip().removeprefix("Error: ").splitlines()[0]
         raise BakeError(f"{path}: not a .blend that Blender {bpy.app.version_string} can open ({reason})") from fault
+
+
+def need_file(path: Path | None) -> None:
+    """Refuse a command that names no file where none is open: Blender runs it though its own FILE does not exist."""
+    if path is None and not bpy.data.filepath:
+        raise BakeError("no scene: no .blend is open, or the one named does not exist; name an existing .blend file")
 
 
 def default_folder(suffix: str) -> Path:
@@ -82,6 +88,14 @@ def scene_problems() -> list[str]:
     return [*_missing_libraries(), *_missing_images(bpy.context.scene)]
 
 
+def scene_warnings() -> list[str]:
+    """What about the open file makes a bake differ from what its author sees."""
+    if not bpy.app.autoexec_fail:
+        return []
+    remedy = "if you trust the file, bake with blender --enable-autoexec -b FILE --command rtgi bake"
+    return [f"the file's Python ({bpy.app.autoexec_fail_message}) was not run; {remedy}"]
+
+
 def _missing_libraries() -> Iterator[str]:
     for library in bpy.data.libraries:
         path = Path(bpy.path.abspath(library.filepath))
@@ -90,34 +104,36 @@ def _missing_libraries() -> Iterator[str]:
 
 
 def _missing_images(scene: bpy.types.Scene) -> Iterator[str]:
+    remedy = "restore the file, or choose another image, or remove the node"
     for image, user in _images_in_use(scene).items():
-        if image.source == "FILE" and image.packed_file is None:
-            path = Path(bpy.path.abspath(image.filepath, library=image.library))
+        if len(image.packed_files):
+            continue
+        for path in _files_of(image):
             if not path.is_file():
                 named = path if image.filepath else "its file (it names none)"
-                remedy = "restore the file, or choose another image, or remove the node"
                 yield f"image {image.name} of {user}: {named} does not exist; {remedy}"
 
 
+def _files_of(image: bpy.types.Image) -> Iterator[Path]:
+    """The files that Blender reads ``image`` from; of a sequence, the one that it names."""
+    path = bpy.path.abspath(image.filepath, library=image.library)
+    if image.source == "TILED":
+        for tile in image.tiles:
+            u, v = (tile.number - 1001) % 10 + 1, (tile.number - 1001) // 10 + 1
+            yield Path(path.replace("<UDIM>", str(tile.number)).replace("<UVTILE>", f"u{u}_v{v}"))
+    elif image.source in {"FILE", "SEQUENCE", "MOVIE"}:
+        yield Path(path)
+
+
 def _images_in_use(scene: bpy.types.Scene) -> dict[bpy.types.Image, str]:
-    """Each image that a material in use or the world reads, with who uses it."""
+    """Each image that what the scene shows reads, with who uses it."""
     users: dict[bpy.types.Image, str] = {}
-    trees = []
-    if scene.world is not None and scene.world.node_tree is not None:
-        trees.append((scene.world.node_tree, f"world {scene.world.name}"))
-    for obj in scene.objects:
-        for slot in obj.material_slots:
-            if slot.material is not None and slot.material.node_tree is not None:
-                trees.append((slot.material.node_tree, f"material {slot.material.name}"))
-    seen = set()
-    while trees:
-        tree, user = trees.pop()
-        if tree in seen:
-            continue
-        seen.add(tree)
-        for node in tree.nodes:
-            if getattr(node, "node_tree", None) is not None:
-                trees.append((node.node_tree, user))
-            elif isinstance(getattr(node, "image", None), bpy.types.Image) and not node.mute:
+    materials = [slot.material for obj in scene.objects for slot in obj.material_slots if slot.material is not None]
+    trees = [(f"material {m.name}", m, MATERIAL_OUTPUT) for m in materials]
+    if scene.world is not None:
+        trees.append((f"world {scene.world.name}", scene.world, WORLD_OUTPUT))
+    for user, block, output in dict.fromkeys(trees):
+        for node in reachable(block.node_tree, output) if uses_nodes(block) else ():
+            if isinstance(getattr(node, "image", None), bpy.types.Image) and not node.mute:
                 users.setdefault(node.image, user)
-    return dict(sorted(users.items(), key=lambda entry: entry[0].name_full))
+    return users

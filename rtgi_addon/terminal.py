@@ -7,12 +7,13 @@ sends everything else to stderr. A reader that goes away (``| head``) ends the t
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, redirect_stdout, suppress
 from typing import Any, TextIO
 
 from tqdm import tqdm
@@ -99,7 +100,7 @@ class JsonLines(Listener):
 
 
 class Plain(Listener):
-    """A line per stage and frame on stderr, the summary on stdout: for logs."""
+    """A line per stage, later per frame, on stderr and the summary on stdout: for logs."""
 
     def __init__(self, out: TextIO, log: TextIO) -> None:
         self._out, self._log = Stream(out), Stream(log)
@@ -107,15 +108,15 @@ class Plain(Listener):
 
     def report(self, stage: str, done: int, total: int) -> None:
         super().report(stage, done, total)
-        if stage != self._stage:
-            self._stage = stage
-            self._log.line(f"{self._place}{stage}")
+        if stage != self._stage and not self._place:
+            self._log.line(stage)
+        self._stage = stage
 
     def frame_begins(self, frame: int, index: int, count: int) -> None:
-        self._place, self._stage = f"frame {frame} ({index + 1}/{count}): ", ""
+        self._place = f"frame {frame} ({index + 1}/{count})"
 
     def frame_done(self, frame: int, record: dict[str, Any]) -> None:
-        self._log.line(f"{self._place}{describe(record)}")
+        self._log.line(f"{self._place}: {describe(record)}")
 
     def warn(self, text: str) -> None:
         self._log.line(f"warning: {text}")
@@ -192,19 +193,31 @@ def make_listener(out: TextIO, *, as_json: bool) -> Listener:
 
 @contextmanager
 def own_stdout(*, hush: bool = False) -> Iterator[TextIO]:
-    """The real stdout as a text file; what others write to file descriptor 1 goes to stderr, or nowhere (``hush``)."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    other = os.open(os.devnull, os.O_WRONLY) if hush else os.dup(2)
-    os.dup2(other, 1)
-    os.close(other)
-    real = os.fdopen(os.dup(kept), "w", encoding="utf-8", newline="\n")
+    """The real stdout as a text file; what others write to it goes to stderr meanwhile, or nowhere (``hush``).
+
+    Both are turned: file descriptor 1, for C, and ``sys.stdout``, which need not write to it.
+    """
+    _flush()
+    python, kept = sys.stdout, os.dup(1)
+    real = python if python.fileno() != 1 else os.fdopen(os.dup(1), "w", encoding="utf-8", newline="\n")
+    other = open(os.devnull, "w", encoding="utf-8") if hush else sys.stderr
+    os.dup2(other.fileno(), 1)
     try:
-        yield real
+        with redirect_stdout(other):
+            yield real
     finally:
         with suppress(BrokenPipeError):  # the reader left while the last line was buffered
-            real.close()
-        with suppress(BrokenPipeError):
-            sys.stdout.flush()
+            real.flush()
+        _flush()
         os.dup2(kept, 1)
         os.close(kept)
+        for file in {real, other} - {python, sys.stderr}:
+            with suppress(BrokenPipeError):
+                file.close()
+
+
+def _flush() -> None:
+    """Empty Python's and C's buffers of stdout: Blender's lines wait in C's, and would come out much later."""
+    with suppress(BrokenPipeError):
+        sys.stdout.flush()
+    ctypes.CDLL("ucrtbase" if os.name == "nt" else None).fflush(None)

@@ -1,0 +1,191 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The frames of a bake: each one's light computed by the session and written before the next begins.
+
+After ``pack``, the last stages of ``bake``. A frame is noted in bake.json once its maps are on disk; a frame that an
+earlier run finished from the same input is kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict, replace
+from itertools import islice
+from typing import Any
+
+import bpy
+import numpy as np
+from numpy.typing import NDArray
+
+from .backend.errors import BakeError, Cancelled
+from .backend.geometry import Geometry
+from .backend.scene import Atlas, FrameState, LightMaps, Material, Scene
+from .backend.session import Session
+from .backend.stats import FrameStats
+from .backend.texels import Texels, place_texels
+from .environment import device, library_folders, versions
+from .exr import write_page
+from .extract import frame_state
+from .job import Plan
+from .output import FORMAT, BakeFolder, FrameFailed, digest, folder_problems, map_bytes, map_name, write_arrays
+from .source import SourceScene
+from .terminal import Listener
+
+
+class FrameStates(Sequence[FrameState]):
+    """The state of the open scene at each of ``frames``, read when asked for and not kept.
+
+    Leaves the scene at the frame last read.
+    """
+
+    def __init__(self, source: SourceScene, frames: Sequence[int], materials: Sequence[Material]) -> None:
+        self._source, self._frames, self._materials = source, frames, materials
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, index: int) -> FrameState:
+        frame = self._frames[index]
+        bpy.context.scene.frame_set(frame)
+        return frame_state(self._source, frame, constants=self._materials)
+
+
+def open_folder(plan: Plan) -> BakeFolder:
+    """The folder that ``plan`` fills; the first thing that is written."""
+    size = {"resolution": plan.atlas.resolution, "pages": plan.atlas.page_count, "kinds": 2}
+    needed = 0 if plan.job.resume else map_bytes(frames=len(plan.frames), **size)
+    if problems := folder_problems(plan.out, needed):
+        raise BakeError(*problems)
+    return BakeFolder(plan.out, header(plan), resume=plan.job.resume)
+
+
+def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict[str, Any]]:
+    """Bake and write all frames of ``plan``; their records as in bake.json, each with ``kept``."""
+    records = []
+    with ExitStack() as stack:
+        session = _once(lambda: stack.enter_context(_session(plan, listener)))
+        for index, frame in enumerate(plan.frames):
+            listener.frame_begins(frame, index, len(plan.frames))
+            records.append(_frame(plan, folder, session, index))
+            listener.frame_done(frame, records[-1])
+        if plan.job.texels:
+            listener.report("texels", 0, 1)
+            write_arrays(plan.out / "texels.npz", texel_arrays(plan, session().texels))
+            listener.report("texels", 1, 1)
+    return records
+
+
+def _session(plan: Plan, listener: Listener) -> Session:
+    return Session(
+        plan.scene, plan.atlas, plan.job.settings, plan.states[0], oidn_paths=library_folders(), report=listener.report
+    )
+
+
+def _once(make: Callable[[], Session]) -> Callable[[], Session]:
+    """``make``, called when first needed: a resumed bake that has all its frames needs no session."""
+    made: list[Session] = []
+
+    def get() -> Session:
+        if not made:
+            made.append(make())
+        return made[0]
+
+    return get
+
+
+def _frame(plan: Plan, folder: BakeFolder, session: Callable[[], Session], index: int) -> dict[str, Any]:
+    placing, frame = FrameStats(), plan.frames[index]
+    with placing.stage("extract"):
+        state = plan.states[index]
+        key = digest(state)
+    if (finished := folder.finished_or_none(frame, key)) is not None:
+        return {**finished, "kept": True}
+    result = session().advance(state)
+    stats = result.stats
+    with stats.stage("write"):
+        names = _write_maps(plan, result.maps)
+    record = {**asdict(stats), "seconds": {**placing.seconds, **stats.seconds}, "state": key, "files": names}
+    return {**folder.commit(frame, record), "kept": False}
+
+
+def _write_maps(plan: Plan, maps: LightMaps) -> list[str]:
+    """Write all pages of all maps; their names."""
+    names = []
+    for kind, pages in (("iim", maps.iim), ("aim", maps.aim), ("caustics", maps.caustics)):
+        for page in range(0 if pages is None else len(pages)):
+            names.append(map_name(kind, page, maps.frame))
+            write_page(plan.out / names[-1], pages[page], maps.valid[page])
+    return names
+
+
+@contextmanager
+def failing(folder: BakeFolder) -> Iterator[None]:
+    """Note in bake.json how the frames ended when they did not end well."""
+    try:
+        yield
+    except BaseException as fault:
+        # On a full disk the note may fail too; bake.json then still lists each finished frame.
+        with suppress(OSError):
+            folder.close("cancelled" if isinstance(fault, Cancelled) else "failed")
+        if isinstance(fault, BakeError):
+            raise FrameFailed(*fault.problems) from fault
+        if isinstance(fault, OSError):
+            remedy = "mend that and go on with --resume"
+            raise FrameFailed(f"{fault.filename or folder.path}: {fault.strerror or fault}; {remedy}") from fault
+        raise
+
+
+def header(plan: Plan) -> dict[str, Any]:
+    """bake.json without its frames."""
+    return {
+        "format": FORMAT,
+        "versions": versions(),
+        "device": device(plan.job.settings.threads),
+        "settings": asdict(plan.job.settings),
+        "first_frame": plan.frames[0],
+        "frames_asked": list(plan.frames),
+        "atlas": describe_atlas(plan.scene, plan.atlas),
+        "setup_seconds": plan.setup_seconds,
+        "warnings": list(plan.warnings),
+        "fingerprint": fingerprint(plan.scene, plan.atlas),
+    }
+
+
+def describe_atlas(scene: Scene, atlas: Atlas) -> dict[str, Any]:
+    """Pages and, for each side of each object, its rectangle in pixels: x, y from the bottom left, width, height."""
+    objects = []
+    for instance, front, back in zip(scene.instances, atlas.front, atlas.back, strict=True):
+        for side, place in (("front", front), ("back", back)):
+            if place is not None:
+                rectangle = [round(v * atlas.resolution) for v in (*place.offset, *place.scale)]
+                objects.append({"name": instance.name, "side": side, **asdict(place), "rectangle": rectangle})
+    return {"resolution": atlas.resolution, "pages": atlas.page_count, "objects": objects}
+
+
+def fingerprint(scene: Scene, atlas: Atlas) -> dict[str, str]:
+    """Digests by the words for what they cover; what moves is in each frame's own ``state``."""
+    bare = [replace(mesh, albedo_map=None, emission_map=None) for mesh in scene.meshes]
+    textures = [(mesh.albedo_map, mesh.emission_map) for mesh in scene.meshes]
+    return {
+        "geometry": digest(bare),
+        "set of objects": digest(scene.instances),
+        "materials or textures": digest([scene.materials, textures]),
+        "lamps": digest(scene.lights),
+        "world": digest(scene.world),
+        "layout of the light maps": digest(atlas),
+    }
+
+
+def texel_arrays(plan: Plan, texels: Texels) -> Iterator[tuple[str, NDArray[Any]]]:
+    """The arrays of texels.npz (DESIGN §7), world space; positions of later frames only where something moves."""
+    geometry = Geometry(plan.scene, plan.states[0])
+    placed = place_texels(texels, geometry)
+    yield from (("page", texels.page), ("row", texels.row), ("col", texels.col))
+    yield "position", geometry.origin + placed.position
+    yield from (("normal", placed.normal), ("area", placed.area))
+    yield from (("object", texels.instance), ("side", texels.side), ("surface", texels.surface))
+    yield "names", np.array([instance.name for instance in plan.scene.instances])
+    if any(instance.moving or instance.deforming for instance in plan.scene.instances):
+        for frame, state in zip(plan.frames[1:], islice(plan.states, 1, None), strict=True):
+            geometry.update(state)
+            yield f"position_{frame:04d}", geometry.origin + place_texels(texels, geometry).position
