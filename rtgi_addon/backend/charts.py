@@ -20,6 +20,8 @@ PROJECTION_COSINE = 0.4067
 CHARTING_TEXELS = 256
 #: Side of the layout that is packed, in texels, for few and for many islands: xatlas' time grows with its square.
 PACKING_TEXELS = (256, 1024)
+#: xatlas stretches charts to whole texels, so that a metre takes somewhat more texels than asked for.
+STRETCH_RESERVE = 1.15
 #: A layout so large has this many texels per island's side, at least.
 ISLAND_TEXELS = 24
 
@@ -87,7 +89,8 @@ def pack_islands(
 ) -> Float32:
     """(t, 3, 2) ``metres_uv`` laid out in [0, 1]² without overlap, islands at least ``margin_px`` apart.
 
-    The margin holds when the layout is shown at ``texels_per_metre``; island borders then lie on texel borders.
+    The margin holds when the layout is shown at ``texels_per_metre``. Island borders of small layouts then lie on
+    texel borders.
     """
     count = int(island.max(initial=-1)) + 1
     if count == 1:
@@ -104,15 +107,17 @@ def pack_islands(
 
 
 def _packing_scale(metres_uv: Float32, islands: int, texels_per_metre: float, margin_px: float) -> tuple[float, int]:
-    """Texels per metre and xatlas' padding that keep ``margin_px``, coarser by a power of two where that is dear."""
+    """Texels per metre and xatlas' padding that keep ``margin_px``, coarser where full resolution would be dear."""
     d1, d2 = metres_uv[:, 1] - metres_uv[:, 0], metres_uv[:, 2] - metres_uv[:, 0]
     area = np.abs(d1[:, 0].astype(np.float64) * d2[:, 1] - d1[:, 1] * d2[:, 0]).sum() / 2
     side = max(area**0.5, float(np.ptp(metres_uv.reshape(-1, 2), axis=0).max()) / 16, 1e-30) * texels_per_metre
-    limit = np.clip(ISLAND_TEXELS * islands**0.5, *PACKING_TEXELS)
-    halvings = max(0, int(np.ceil(np.log2(side / limit)))) if side > 0 else 0
-    # xatlas keeps 2 padding + 1 texels between charts.
-    padding = max(0, int(np.ceil((margin_px / 2**halvings - 1) / 2)))
-    return texels_per_metre / 2**halvings, padding
+    limit = float(np.clip(ISLAND_TEXELS * islands**0.5, *PACKING_TEXELS))
+    wanted_px = margin_px * STRETCH_RESERVE
+    if side <= limit:
+        # xatlas keeps 2 padding + 1 texels between charts.
+        return texels_per_metre, max(0, int(np.ceil((wanted_px - 1) / 2)))
+    # One coarse texel is margin enough.
+    return texels_per_metre / max(wanted_px, side / limit), 0
 
 
 def _generate(atlas: xatlas.Atlas, *, texels_per_unit: float, padding: int) -> Float32:

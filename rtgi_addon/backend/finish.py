@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""From gathered texels to light-map pages: texels under geometry filled, noise filtered, borders padded.
+"""From gathered texels to light-map pages: texels under geometry filled, noise filtered, seams closed, borders padded.
 
 The last stages of a frame; what they need of the atlas is made once per session.
 """
@@ -15,7 +15,8 @@ from scipy.spatial import cKDTree
 from .denoise import MapDenoiser
 from .dilate import DilationMap
 from .oidn import Denoiser, OidnError, find_oidn
-from .scene import Bool, Float32, Int32
+from .scene import Atlas, Bool, Float32, Int32, Scene
+from .seams import SeamMatcher
 from .settings import BakeSettings
 from .texels import Texels
 
@@ -23,9 +24,12 @@ from .texels import Texels
 class Finisher:
     """The last stages of one atlas. Holds the denoiser, which :meth:`close` gives back."""
 
-    def __init__(self, texels: Texels, settings: BakeSettings, oidn_paths: Sequence[Path]) -> None:
+    def __init__(
+        self, scene: Scene, atlas: Atlas, texels: Texels, settings: BakeSettings, oidn_paths: Sequence[Path]
+    ) -> None:
         self._texels = texels
         self._dilation = DilationMap(texels.index)
+        self._seams = SeamMatcher(scene, atlas, self._dilation, texels.surface) if settings.seams else None
         self.warnings: list[str] = []
         self._oidn = self._open_oidn(settings, oidn_paths)
         self._denoiser = MapDenoiser(self._oidn, texels.index, texels.surface) if self._oidn else None
@@ -36,10 +40,6 @@ class Finisher:
             self._oidn.close()
             self._oidn = None
             self._denoiser = None
-
-    @property
-    def denoises(self) -> bool:
-        return self._denoiser is not None
 
     def _open_oidn(self, settings: BakeSettings, paths: Sequence[Path]) -> Denoiser | None:
         if not settings.denoise or not self._texels.count:
@@ -65,6 +65,10 @@ class Finisher:
     def denoise(self, values: Float32) -> Float32:
         """``values`` (n, 3) filtered, or as they are where there is no denoiser."""
         return values if self._denoiser is None else self._denoiser.denoise(np.maximum(values, 0))
+
+    def close_seams(self, values: Float32) -> Float32:
+        """``values`` (n, 3) matched along the cuts through smooth surfaces, or as they are when not asked for."""
+        return values if self._seams is None else self._seams.match(values)
 
     def to_pages(self, values: Float32) -> Float32:
         """(pages, H, W, 3) pages of ``values`` (n, 3), with padding."""

@@ -75,9 +75,8 @@ class Geometry:
 
     def offset_length(self, positions: Float32) -> Float32:
         """(n,) m: how far a ray's origin is lifted off its surface at ``positions`` (n, 3)."""
-        return np.abs(positions).max(axis=1, initial=0.0) * np.float32(OFFSET_OF_COORDINATE) + np.float32(
-            self.extent * OFFSET_OF_EXTENT
-        )
+        largest = np.abs(positions).max(axis=1, initial=0.0)
+        return np.asarray(largest * OFFSET_OF_COORDINATE + self.extent * OFFSET_OF_EXTENT, np.float32)
 
     def _place(self, index: int, state: FrameState) -> None:
         mesh_index = self.scene.instances[index].mesh

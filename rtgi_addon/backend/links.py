@@ -190,9 +190,7 @@ class LinkTracer:
         weight.reshape(-1)[at[hidden]] = 0
         return (target, weight.astype(np.float32), np.ones(weight.shape, np.bool_)), len(at)
 
-    def _beyond(
-        self, first: int, hits: Hits, target: Int32, directions: Float32
-    ) -> tuple[Int32, Int32, Float32, int]:
+    def _beyond(self, first: int, hits: Hits, target: Int32, directions: Float32) -> tuple[Int32, Int32, Float32, int]:
         """((b,) texel, (b,) target, (b, 3) weight, rays): where rays go on from surfaces that pass them."""
         none = np.zeros(0, np.int32), np.zeros(0, np.int32), np.zeros((0, 3), np.float32), 0
         if not self._see_through or self._max_specular == 0:
@@ -257,7 +255,9 @@ class LinkTracer:
         return self._aim_table
 
 
-def trace_links(tracer: LinkTracer, texel_count: int, target_count: int, samples: SampleCounts, workers: Workers) -> Links:
+def trace_links(
+    tracer: LinkTracer, texel_count: int, target_count: int, samples: SampleCounts, workers: Workers
+) -> Links:
     """Links of all texels."""
     chunk = max(1, CHUNK_RAYS // samples.total)
     parts = workers.map_slices(lambda s: tracer.trace(s.start, s.stop), texel_count, chunk)
@@ -287,13 +287,15 @@ def _beyond_matrices(traced: TracedLinks, weight: Float32, target_count: int) ->
 def _row_scale(weight: Float32) -> Float32:
     """(n,) what makes each row of ``weight`` (n, K) sum to one; 0 for a row of zeros."""
     total = weight.sum(axis=1, dtype=np.float64)
-    return np.divide(1.0, total, out=np.zeros_like(total), where=total > 0).astype(np.float32)
+    return np.asarray(np.divide(1.0, total, out=np.zeros_like(total), where=total > 0), np.float32)
 
 
 def _first_half(columns: int, samples: SampleCounts) -> Bool:
     """(columns,) the first half of the cosine rays and of the aimed ones; each half is well spread by itself."""
     number = np.arange(columns)
-    return np.where(number < samples.cosine, number < samples.cosine // 2, number - samples.cosine < samples.bright // 2)
+    return np.where(
+        number < samples.cosine, number < samples.cosine // 2, number - samples.cosine < samples.bright // 2
+    )
 
 
 def _matrix(target: Int32, weight: Float32, columns: slice | Bool, target_count: int) -> sparse.csr_matrix:

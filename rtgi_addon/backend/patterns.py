@@ -13,7 +13,7 @@ from functools import lru_cache
 import numpy as np
 
 from .rasterise import POINTS
-from .sampling import hash_keys, sample_cosine_hemisphere, stratified_pair, unit_float32
+from .sampling import UInt32, hash_keys, sample_cosine_hemisphere, stratified_pair, unit_float32
 from .scene import Float32, Int32
 
 PATTERNS = 1024
@@ -53,7 +53,7 @@ def bright_patterns(count: int, seed: int) -> BrightPatterns:
     return BrightPatterns(choice, on_target.astype(np.float32), _starts(keys, count, 3, seed))
 
 
-def _starts(keys: np.ndarray, count: int, pair: int, seed: int) -> Int32:
+def _starts(keys: UInt32, count: int, pair: int, seed: int) -> Int32:
     """(P, count) points 0..POINTS-1, each as often as the others, in an order of its own for each pattern."""
     spread = unit_float32(stratified_pair(keys, count, pair=pair, seed=seed)[0])
     return (spread * POINTS).astype(np.int32)

@@ -37,9 +37,7 @@ def solve(links: Links, outside: Float32, albedo: Float32, emitted: Float32) -> 
     outside (n, 3): irradiance that does not come by links · albedo (n, 3) · emitted (m, 3): radiosity that targets
     send of themselves, W/m² (texels: π Le; sky patches: π L).
     """
-    count = len(outside)
-    source = links.irradiance(emitted)
-    b = outside + source
+    b = outside + links.irradiance(emitted)
 
     def bounce(x: Float32) -> Float32:
         return links.irradiance(_padded(albedo * x, len(emitted)))

@@ -127,7 +127,7 @@ def _pairs_of(triangles: Int32, corner_px: Float64, low: Int32, size: Int32) -> 
 
 def _edge_functions(a: Float64, b: Float64, c: Float64) -> list[tuple[Float64, Float64, Float64]]:
     """Three (nx, ny, offset) per triangle: non-negative inside, whatever the winding."""
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    area: Float64 = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     sign = np.where(area < 0, -1.0, 1.0)
     edges = []
     for p, q in ((a, b), (b, c), (c, a)):
@@ -171,7 +171,7 @@ def _nearest_points(p: Float64, a: Float64, b: Float64, c: Float64) -> Float64:
     inside = np.ones(len(p), np.bool_)
     for nx, ny, offset in _edge_functions(a, b, c):
         inside &= nx * p[:, 0] + ny * p[:, 1] + offset >= 0
-    area = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    area: Float64 = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     inside &= np.abs(area) > FLAT_AREA_PX
     best[inside] = p[inside]
     return best

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """One bake: the state that lives between frames, and the stages of a frame in their order.
 
-``Session.advance`` is the page that lists them: place → direct → caustics → links → aim → finish (seams, denoise,
-pages). Only the session keeps state; every stage is a function of arrays.
+``Session.advance`` is the page that lists them: place → direct → caustics → links → aim → denoise → seams → pages.
+Only the session keeps state; every stage is a function of arrays.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from .parallel import Workers
 from .progress import Report, silent
 from .radiosity import Illumination
 from .scatter import Surfaces, make_surfaces
-from .scene import Atlas, Float32, FrameState, LightMaps, Scene
+from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
 from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts
 from .sky import Sky, make_sky
 from .stats import FrameStats
@@ -32,6 +32,14 @@ from .tracing import EmbreeTracer
 
 #: Each frame has so many stages to report.
 STAGE_COUNT = 6
+#: Rays of the first try when a target error is set.
+PILOT = SampleCounts(16, 16)
+#: A frame that does not meet its target with so many rays a texel is given as it is, with a warning.
+MOST_RAYS = 4096
+#: Denoised error falls about with the cube root of the rays (measured: 3.0 % at 32, 1.5 % at 256).
+ERROR_EXPONENT = 3.0
+#: Least and most that one more try multiplies the rays by.
+GROWTH = (1.5, 8.0)
 
 
 @dataclass(frozen=True)
@@ -50,6 +58,18 @@ class _Placed:
     albedo: Float32  # (n, 3)
     emitted: Float32  # (m, 3) radiosity that targets send of themselves, W/m²
     sky: Sky | None
+
+
+@dataclass(frozen=True)
+class _Lit:
+    """One frame's light on the texels, before seams are closed."""
+
+    frame: int
+    samples: SampleCounts
+    aim: Float32  # (n, 3) W/m²
+    iim: Float32  # (n, 3) W/m², denoised
+    valid: Bool  # (n,)
+    estimated_error: float | None
 
 
 class Session:
@@ -76,7 +96,7 @@ class Session:
         self._tracer = EmbreeTracer(scene, self.geometry, state, self._workers)
         self.texels = make_texels(scene, atlas, self.geometry)
         self._bounds = emission.make_bounds(self.geometry)
-        self._finisher = Finisher(self.texels, settings, oidn_paths)
+        self._finisher = Finisher(scene, atlas, self.texels, settings, oidn_paths)
 
     def close(self) -> None:
         """Give threads and the denoiser back."""
@@ -86,7 +106,9 @@ class Session:
     def __enter__(self) -> Session:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
 
     def advance(self, state: FrameState) -> FrameResult:
@@ -102,8 +124,51 @@ class Session:
             caustic = self._caustics(placed, stats)
         self._report("caustics", 3, STAGE_COUNT)
         outside = direct if caustic is None else direct + caustic
-        links, light = self._gather_to_target(placed, outside, stats)
-        return FrameResult(self._finish(placed, links, light, caustic, stats), stats)
+        lit = self._illuminate(placed, outside, self._first_samples(), stats)
+        while (more := self._more_samples(lit, stats)) is not None:
+            lit = self._illuminate(placed, outside, more, stats)
+        with stats.stage("seams"):
+            iim = self._finisher.close_seams(lit.iim)
+        with stats.stage("pages"):
+            maps = self._pages(placed, lit, iim, caustic)
+        self._report("pages", STAGE_COUNT, STAGE_COUNT)
+        stats.estimated_error = lit.estimated_error
+        stats.warnings += self._finisher.warnings
+        return FrameResult(maps, stats)
+
+    def _first_samples(self) -> SampleCounts:
+        return PILOT if self.settings.target_error is not None else self.settings.samples
+
+    def _more_samples(self, lit: _Lit, stats: FrameStats) -> SampleCounts | None:
+        """Rays for another try when the target error is not met; None when it is, or none was asked for."""
+        target, error = self.settings.target_error, lit.estimated_error
+        if target is None or error is None or error <= target:
+            return None
+        if lit.samples.total >= MOST_RAYS:
+            stats.warnings.append(
+                f"frame {lit.frame}: estimated error {error:.2%} with {MOST_RAYS} rays a texel, "
+                f"above the target of {target:.2%}; raise the target or the map's resolution"
+            )
+            return None
+        growth = np.clip((error / target) ** ERROR_EXPONENT, *GROWTH)
+        each = min(MOST_RAYS // 2, int(np.ceil(lit.samples.cosine * growth / 8)) * 8)
+        return SampleCounts(each, each)
+
+    def _illuminate(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> _Lit:
+        """Links with ``samples``, the light they bring, and how far it may be off."""
+        with stats.stage("links"):
+            links = self._links(placed, outside, samples, stats)
+        self._report("links", 4, STAGE_COUNT)
+        with stats.stage("aim"):
+            light = self._light(placed, outside, links, stats)
+        self._report("aim", 5, STAGE_COUNT)
+        with stats.stage("denoise"):
+            end = self._finisher
+            known = placed.emitted.copy()
+            known[: self.texels.count] += placed.albedo * light.aim
+            iim = end.denoise(end.fill(light.iim, links.valid))
+            half = end.denoise(end.fill(links.irradiance(known, half=0), links.valid))
+        return _Lit(placed.state.frame, samples, light.aim, iim, links.valid, noise_estimate(iim, half))
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
@@ -153,17 +218,6 @@ class Session:
         k = self.settings.nearest_photons
         return caustics.caustic_irradiance(paths, self.texels, placed.frame, self._workers, k=k)
 
-    def _gather_to_target(self, placed: _Placed, outside: Float32, stats: FrameStats) -> tuple[Links, Illumination]:
-        """Links and light with as many rays as the settings name, or as the target error needs."""
-        samples = self.settings.samples
-        with stats.stage("links"):
-            links = self._links(placed, outside, samples, stats)
-        self._report("links", 4, STAGE_COUNT)
-        with stats.stage("aim"):
-            light = self._light(placed, outside, links, stats)
-        self._report("aim", 5, STAGE_COUNT)
-        return links, light
-
     def _links(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> Links:
         known = placed.emitted.copy()
         known[: self.texels.count] += placed.albedo * outside
@@ -199,34 +253,20 @@ class Session:
         stats.photons_traced += len(paths.light)
         return paths
 
-    def _density(self, paths: photons.PhotonPaths, hits: np.ndarray, placed: _Placed) -> Float32:
-        found = photon_map.make_photon_map(paths, self.texels, hits)
+    def _density(self, paths: photons.PhotonPaths, hits: Bool, placed: _Placed) -> Float32:
+        found = photon_map.make_photon_map(paths, hits)
         k = self.settings.nearest_photons
         return photon_map.photon_irradiance(found, self.texels, placed.frame, self._workers, k=k)
 
-    def _finish(
-        self, placed: _Placed, links: Links, light: Illumination, caustic: Float32 | None, stats: FrameStats
-    ) -> LightMaps:
-        """Maps of texels as pages; also the estimate of the IIM's error, from half of the rays."""
-        end, valid = self._finisher, links.valid
-        known = placed.emitted.copy()
-        known[: self.texels.count] += placed.albedo * light.aim
-        iim = end.fill(light.iim, valid)
-        half = end.fill(links.irradiance(known, half=0), valid)
-        with stats.stage("denoise"):
-            iim, half = end.denoise(iim), end.denoise(half)
-        stats.estimated_error = noise_estimate(iim, half)
-        stats.warnings += end.warnings
-        with stats.stage("pages"):
-            maps = LightMaps(
-                frame=placed.state.frame,
-                iim=end.to_pages(iim),
-                aim=end.to_pages(end.fill(light.aim, valid)),
-                caustics=None if caustic is None else end.to_pages(end.fill(caustic, valid)),
-                valid=end.valid_pages(valid),
-            )
-        self._report("finish", STAGE_COUNT, STAGE_COUNT)
-        return maps
+    def _pages(self, placed: _Placed, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
+        end = self._finisher
+        return LightMaps(
+            frame=placed.state.frame,
+            iim=end.to_pages(iim),
+            aim=end.to_pages(end.fill(lit.aim, lit.valid)),
+            caustics=None if caustic is None else end.to_pages(end.fill(caustic, lit.valid)),
+            valid=end.valid_pages(lit.valid),
+        )
 
 
 def noise_estimate(full: Float32, half: Float32) -> float | None:

@@ -48,7 +48,7 @@ class Sky:
         z = low + (high - low) * up
         ring = np.sqrt(np.maximum(1 - z * z, 0))
         angle = (0.5 - u) * 2 * np.pi
-        return np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1).astype(np.float32)
+        return np.asarray(np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1), np.float32)
 
 
 def make_sky(world: World | None) -> Sky | None:
@@ -70,4 +70,4 @@ def _shrunk(image: Float32) -> Float32:
         if factor > image.shape[0]:
             return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
-    return image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3)).astype(np.float32)
+    return np.asarray(image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3)), np.float32)

@@ -108,7 +108,9 @@ def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
             if key not in rasters:
                 rasters[key] = rasterise(start, mesh.island_of_triangle)
             triangles = geometry.triangles_of(number)
-            rows = slice(side * geometry.triangle_count + triangles.start, side * geometry.triangle_count + triangles.stop)
+            rows = slice(
+                side * geometry.triangle_count + triangles.start, side * geometry.triangle_count + triangles.stop
+            )
             affine[rows] = _affine(corner_px)
             page_start[rows] = placement.page * atlas.resolution**2
             raster = rasters[key]
@@ -162,7 +164,10 @@ def _columns(
         "instance": same(lambda p: p.instance),
         "side": same(lambda p: p.side),
         "surface": np.concatenate(
-            [np.zeros(0, np.int32), *(i[p.raster.triangle] + p.first_surface for p, i in zip(parts, islands, strict=True))]
+            [
+                np.zeros(0, np.int32),
+                *(i[p.raster.triangle] + p.first_surface for p, i in zip(parts, islands, strict=True)),
+            ]
         ).astype(np.int32),
         "triangle": joined(lambda p: p.raster.triangle + p.first_triangle, (), np.int32),
         "barycentric": joined(lambda p: p.raster.barycentric, (2,), np.float32),

@@ -36,7 +36,7 @@ class Hits:
         """(n,) the ray came from behind the surface."""
         return self.cosine > 0
 
-    def take(self, rows: NDArray[np.integer]) -> Hits:
+    def take(self, rows: NDArray[np.integer[Any]]) -> Hits:
         """The hits of ``rows`` (k,), in that order."""
         return Hits(*(column[rows] for column in (self.triangle, self.u, self.v, self.distance, self.cosine)))
 

@@ -78,7 +78,9 @@ def box(name: str, size, *, texels: int, inward: bool = False, material: int = 0
     return mesh_of_triangles(name, corners, uvs, islands, material=material)
 
 
-def sphere(name: str, radius: float, *, rings: int, inward: bool = True, smooth: bool = True, material: int = 0) -> Mesh:
+def sphere(
+    name: str, radius: float, *, rings: int, inward: bool = True, smooth: bool = True, material: int = 0
+) -> Mesh:
     """A latitude-longitude sphere, one island whose map is longitude by height (equal areas)."""
     segments = 2 * rings
     heights = np.linspace(-1, 1, rings + 1)
@@ -124,7 +126,9 @@ def grid_atlas(scene: Scene, sizes: list[tuple[int, int]], *, back: tuple[int, .
         return Placement(0, scale, (spots[i, s][0] / resolution, spots[i, s][1] / resolution))
 
     count = len(scene.instances)
-    return Atlas(resolution, 1, tuple(placement(i, 0) for i in range(count)), tuple(placement(i, 1) for i in range(count)))
+    return Atlas(
+        resolution, 1, tuple(placement(i, 0) for i in range(count)), tuple(placement(i, 1) for i in range(count))
+    )
 
 
 def point_light(position, power=100.0, name: str = "lamp") -> Light:

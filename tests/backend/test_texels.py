@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.backend import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -13,6 +12,7 @@ from rtgi_addon.backend.geometry import Geometry
 from rtgi_addon.backend.rasterise import rasterise
 from rtgi_addon.backend.scene import Atlas, Instance, Placement, Scene
 from rtgi_addon.backend.texels import make_texels, place_texels, texel_colours
+from tests.backend import scenes
 
 
 def texels_of(scene: Scene, atlas: Atlas):
@@ -50,7 +50,9 @@ def test_any_point_of_any_triangle_finds_a_texel_of_its_own_island(seed):
     """Also slivers, triangles smaller than a texel, and points on edges."""
     rng = np.random.default_rng(seed)
     corners = rng.uniform(0, 1, (40, 3, 3))
-    uv = rng.uniform(0.1, 0.9, (40, 1, 2)) + rng.uniform(-0.1, 0.1, (40, 3, 2)) * rng.choice([1, 0.1, 0.001], (40, 1, 1))
+    uv = rng.uniform(0.1, 0.9, (40, 1, 2)) + rng.uniform(-0.1, 0.1, (40, 3, 2)) * rng.choice(
+        [1, 0.1, 0.001], (40, 1, 1)
+    )
     mesh = scenes.mesh_of_triangles("soup", corners, uv, np.zeros(40, int))
     scene, atlas = one(mesh, size=(24, 24))
     _, texels, frame = texels_of(scene, atlas)

@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.backend import scenes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -15,6 +14,7 @@ from rtgi_addon.backend.geometry import Geometry, triangle_normals
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.scene import Instance, Scene
 from rtgi_addon.backend.tracing import EmbreeTracer
+from tests.backend import scenes
 
 UNIT_QUAD = scenes.quad("quad", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
 
@@ -119,7 +119,9 @@ def test_a_million_metres_out_nothing_is_lost():
     _, far_geometry, away = tracer_of(Instance("q", 0, far))
     np.testing.assert_allclose(far_geometry.corners, near_geometry.corners, atol=1e-6)
     origins, directions = rays(2_000)
-    np.testing.assert_array_equal(near.intersect(origins, directions).triangle, away.intersect(origins, directions).triangle)
+    np.testing.assert_array_equal(
+        near.intersect(origins, directions).triangle, away.intersect(origins, directions).triangle
+    )
 
 
 def test_empty_scene_answers():
