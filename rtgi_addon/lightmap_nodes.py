@@ -165,7 +165,7 @@ def _follow(
     for curve in [c for c in animation.drivers if c.data_path == path]:
         copy = animation.drivers.from_existing(src_driver=curve)
         copy.data_path = target.path_from_id("default_value")
-    for curve in [c for c in _curves(animation) if c.data_path == path]:
+    for curve in [c for c in animation_curves(animation) if c.data_path == path]:
         _copy_curve(curve, target, frames)
 
 
@@ -187,7 +187,7 @@ def _copy_curve(curve: bpy.types.FCurve, target: bpy.types.NodeSocket, frames: S
     copy.extrapolation = "CONSTANT"
 
 
-def _curves(animation: bpy.types.AnimData) -> list[bpy.types.FCurve]:
+def animation_curves(animation: bpy.types.AnimData) -> list[bpy.types.FCurve]:
     """The F-curves of the action in use, whether it has slots (4.4 and later) or not."""
     action = animation.action
     if action is None:
