@@ -20,8 +20,8 @@ from .scene import Float32
 
 _CPU = 1  # OIDN_DEVICE_TYPE_CPU: GPUs give other bits
 _FLOAT3 = 3  # OIDN_FORMAT_FLOAT3
-#: Above this much memory OIDN cuts the image into tiles. Its own default follows the machine, and so would the bits.
-_MEMORY_MB = 4096
+#: Above this much memory OIDN cuts the image into tiles (same bits, measured). Its own default follows the machine.
+_MEMORY_MB = 2048
 _NAMES = {
     "win32": ("OpenImageDenoise.dll",),
     "darwin": ("libOpenImageDenoise.2.dylib", "libOpenImageDenoise.2.*.dylib", "libOpenImageDenoise.dylib"),

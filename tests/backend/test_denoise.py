@@ -251,6 +251,46 @@ def test_tiny_surfaces(denoiser):
 
 
 @needs_oidn
+def test_texels_that_are_not_valid_are_not_looked_at(denoiser):
+    """Whatever is under the block that stands on the floor, NaN too, the floor around it is the same to the bit."""
+    index, surface = FOUR
+    values = noise(len(surface))
+    valid = np.ones(len(surface), np.bool_)
+    valid[index[0, 15:25, 15:30]] = False
+    valid[surface == 3] = False
+    maps = MapDenoiser(denoiser, index, surface)
+    results = []
+    for rubbish in (0, 1e9, -1, np.nan):
+        results.append(maps.denoise(np.where(valid[:, None], values, np.float32(rubbish)), valid=valid))
+        np.testing.assert_array_equal(results[-1], results[0])
+    assert not results[0][surface == 3].any()
+    hidden = results[0][~valid & (surface == 0)]
+    np.testing.assert_allclose(hidden, 1, atol=0.3)
+    for number in range(3):
+        here = valid & (surface == number)
+        np.testing.assert_allclose(results[0][here].mean(axis=0), values[here].mean(axis=0), rtol=1e-4)
+    np.testing.assert_array_equal(maps.denoise(values), MapDenoiser(denoiser, index, surface).denoise(values))
+
+
+@needs_oidn
+def test_no_streaks_around_invalid_texels(denoiser):
+    """Next to the hidden texels the error is that of the rest; repeated border texels leave twice as much there."""
+    index, surface = layout((3, 3, 60, 60))
+    valid = np.ones(len(surface), np.bool_)
+    valid[index[0, 23:43, 23:43]] = False
+    near = np.zeros_like(valid)
+    near[index[0, 21:45, 21:45]] = True
+    near &= valid
+    maps = MapDenoiser(denoiser, index, surface)
+    errors = []
+    for seed in range(4):
+        error = maps.denoise(noise(len(surface), seed, shape=1.5), valid=valid) - 1
+        errors.append([np.mean(error[near] ** 2), np.mean(error[valid] ** 2)])
+    near_error, error = np.sqrt(np.mean(errors, axis=0))
+    assert near_error < 1.5 * error
+
+
+@needs_oidn
 def test_no_texels_at_all(denoiser):
     empty = MapDenoiser(denoiser, np.full((2, 32, 32), -1, np.int32), np.zeros(0, np.int32))
     assert empty.denoise(np.zeros((0, 3), np.float32)).shape == (0, 3)
