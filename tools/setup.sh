@@ -22,11 +22,11 @@ find_python() {
 
 folder=$1
 case ${2:-any} in
-    4.5 | 5.0) wanted="3.11:$2" ;;
+    4.2 | 4.5 | 5.0) wanted="3.11:$2" ;;
     5.2) wanted="3.13:$2" ;;
     any) wanted="3.11:5.0 3.13:5.2" ;;
     *)
-        echo "setup: no requirements for Blender $2; there are: 4.5, 5.0, 5.2" >&2
+        echo "setup: no requirements for Blender $2; there are: 4.2, 4.5, 5.0, 5.2" >&2
         exit 2
         ;;
 esac
