@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import Field, fields
 from enum import EnumType
 from pathlib import Path
@@ -147,20 +147,21 @@ def _choices(hint: Any) -> list[str]:
 
 def settings_of(arguments: argparse.Namespace) -> BakeSettings:
     """The settings that the parsed arguments ask for; every value out of its range is one problem line."""
-    hints = get_type_hints(BakeSettings)
-    values, problems = {}, []
+    problems = []
     for f in fields(BakeSettings):
-        value, low, high = (
-            getattr(arguments, f.name),
-            f.metadata["low"],
-            f.metadata["high"],
-        )
-        values[f.name] = hints[f.name](value) if _choices(hints[f.name]) else value
+        value, low, high = getattr(arguments, f.name), f.metadata["low"], f.metadata["high"]
         if value is not None and low is not None and not low <= value <= high:
             problems.append(f"--{f.name.replace('_', '-')} {value}: out of range; give a value in [{low}, {high}]")
     if problems:
         raise BakeError(*problems)
-    return BakeSettings(**values)
+    return typed_settings(vars(arguments))
+
+
+def typed_settings(values: Mapping[str, Any]) -> BakeSettings:
+    """Settings from ``values`` by field name, words for the enumerated ones; other keys are ignored."""
+    hints = get_type_hints(BakeSettings)
+    names = [f.name for f in fields(BakeSettings)]
+    return BakeSettings(**{n: hints[n](values[n]) if _choices(hints[n]) else values[n] for n in names})
 
 
 def frames_of(text: str | None) -> Sequence[int] | None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,8 @@ from .extract.source_scene import frame_kept
 from .frames import FrameStates, bake_frames, failing, open_folder
 from .job import BakeJob, Plan
 from .layouts import assemble, expected_densities, lay_out, map_sizes
-from .lit_copy import save_lit_copy
+from .lightmaps import remove_lightmaps
+from .lit_copy import is_lit, save_lit_copy
 from .output import folder_problems, map_bytes
 from .scene_file import default_folder, default_frames, open_blend, scene_problems, scene_warnings
 from .terminal import Listener
@@ -57,6 +59,7 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
     report, setup, start = listener.report, FrameStats(), time.perf_counter()
     with setup.stage("open"):
         open_blend(job.scene)
+        _unlight(job)
         frames, out = _checked(job)
         report("open", 1, 1)
     with frame_kept(bpy.context.scene):
@@ -86,10 +89,20 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
             records = bake_frames(plan, folder, listener)
             if job.save_blend is not None:
                 report("save", 0, 1)
-                save_lit_copy(job.save_blend, source, layouts, plan)
+                for text in save_lit_copy(job.save_blend, source, layouts, plan):
+                    listener.warn(text)
                 report("save", 1, 1)
             folder.close("done")
     return _summary(plan, records, time.perf_counter() - start)
+
+
+def _unlight(job: BakeJob) -> None:
+    """Bake the scene itself, not the light maps that an earlier bake put on it; touch none but a file of its own."""
+    if not is_lit():
+        return
+    if job.scene is None:
+        raise BakeError("the open scene shows light maps; take them off with remove_lightmaps() and bake it then")
+    remove_lightmaps()
 
 
 def _checked(job: BakeJob) -> tuple[Sequence[int], Path]:
@@ -100,6 +113,8 @@ def _checked(job: BakeJob) -> tuple[Sequence[int], Path]:
         out = default_folder("rtgi") if out is None else out
     except BakeError as fault:
         problems += fault.problems
+    if job.save_blend is not None and len({b - a for a, b in pairwise(frames)}) > 1:
+        problems.append(f"{job.save_blend}: image sequences need evenly spaced frames; choose such, or do not save it")
     needed = map_bytes(frames=len(frames), resolution=job.settings.resolution, pages=1, kinds=2)
     problems += [] if out is None else folder_problems(out, needed)
     if job.save_blend is not None:

@@ -114,11 +114,10 @@ def _bake(arguments: argparse.Namespace, listener: Listener) -> Summary:
     _need_bpy()
     from .bake import bake
     from .job import BakeJob
-    from .scene_file import need_file
+    from .scene_file import named_or_open
 
-    need_file(path_of(arguments.scene))
     job = BakeJob(
-        scene=path_of(arguments.scene),
+        scene=named_or_open(path_of(arguments.scene)),
         frames=frames,
         out=path_of(arguments.out),
         settings=settings,

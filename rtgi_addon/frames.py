@@ -35,10 +35,11 @@ from .terminal import Listener
 class FrameStates(Sequence[FrameState]):
     """The state of the open scene at each of ``frames``, read when asked for and not kept.
 
-    Leaves the scene at the frame last read.
+    ``materials`` are those of the first frame; without them, animated ones are not followed. Leaves the scene at the
+    frame last read.
     """
 
-    def __init__(self, source: SourceScene, frames: Sequence[int], materials: Sequence[Material]) -> None:
+    def __init__(self, source: SourceScene, frames: Sequence[int], materials: Sequence[Material] | None) -> None:
         self._source, self._frames, self._materials = source, frames, materials
 
     def __len__(self) -> int:

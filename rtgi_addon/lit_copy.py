@@ -12,9 +12,15 @@ from pathlib import Path
 import bpy
 
 from .job import Plan
+from .lightmap_nodes import MARK
 from .lightmaps import apply_lightmaps, map_files, remove_lightmaps
 from .output import whole_file
 from .source import Layout, SourceScene
+
+
+def is_lit() -> bool:
+    """Does the open scene show light maps already? They would be baked as if its surfaces shone."""
+    return any(group.get(MARK) for group in bpy.data.node_groups)
 
 
 def save_lit_copy(path: Path, source: SourceScene, layouts: Sequence[Layout], plan: Plan) -> tuple[str, ...]:

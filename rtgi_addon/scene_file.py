@@ -40,10 +40,11 @@ def open_blend(path: Path | None) -> None:
         raise BakeError(f"{path}: not a .blend that Blender {bpy.app.version_string} can open ({reason})") from fault
 
 
-def need_file(path: Path | None) -> None:
-    """Refuse a command that names no file where none is open: Blender runs it though its own FILE does not exist."""
+def named_or_open(path: Path | None) -> Path:
+    """``path``, or that of the open file. Blender runs a command though the FILE before it does not exist."""
     if path is None and not bpy.data.filepath:
         raise BakeError("no scene: no .blend is open, or the one named does not exist; name an existing .blend file")
+    return Path(bpy.data.filepath).absolute() if path is None else path
 
 
 def default_folder(suffix: str) -> Path:

@@ -132,20 +132,19 @@ class Bar(Listener):
     def __init__(self, out: TextIO, terminal: TextIO) -> None:
         self._out, self._terminal = Stream(out), terminal
         self._frames: tqdm[Any] | None = None
-        self._stage = tqdm(
-            file=terminal,
-            leave=False,
-            position=0,
-            bar_format="{desc:<20} {bar:24} {n_fmt}/{total_fmt} {remaining}",
-        )
+        self._stage: tqdm[Any] | None = None
 
     def report(self, stage: str, done: int, total: int) -> None:
         super().report(stage, done, total)
-        if self._stage.desc != stage or self._stage.total != total or done < self._stage.n:
+        if self._stage is None:
+            layout = "{desc:<20} {bar:24} {n_fmt}/{total_fmt} {remaining}"
+            self._stage = tqdm(desc=stage, total=total, file=self._terminal, leave=False, bar_format=layout)
+        new = self._stage.desc != stage
+        self._stage.set_description_str(stage, refresh=False)
+        if self._stage.total != total or done < self._stage.n:
             self._stage.reset(total)
-            self._stage.set_description_str(stage, refresh=False)
         self._stage.update(done - self._stage.n)
-        if done >= total:
+        if new or done == total:
             self._stage.refresh()
 
     def frame_begins(self, frame: int, index: int, count: int) -> None:
@@ -169,9 +168,9 @@ class Bar(Listener):
         tqdm.write(f"warning: {text}", file=self._terminal)
 
     def finish(self, event: str, fields: dict[str, Any], lines: Sequence[str]) -> None:
-        self._stage.close()
-        if self._frames is not None:
-            self._frames.close()
+        for bar in (self._stage, self._frames):
+            if bar is not None:
+                bar.close()
         for text in lines:
             (self._out if event == "done" else Stream(self._terminal)).line(text)
 

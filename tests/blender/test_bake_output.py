@@ -18,6 +18,7 @@ import bpy
 import numpy as np
 import pytest
 
+from rtgi_addon.backend.errors import BakeError
 from rtgi_addon.backend.settings import BakeSettings, Quality
 from rtgi_addon.bake import bake
 from rtgi_addon.cli import run
@@ -333,3 +334,26 @@ def test_a_killed_bake_goes_on_and_ends_as_if_it_had_not_been(
     assert bake_to(tmp_path / "out", scene_file, "--resume") == 0
     assert maps_of(tmp_path / "out") == maps_of(tmp_path / "whole")
     assert not list((tmp_path / "out").glob(".*"))
+
+
+def test_a_saved_copy_shows_the_maps_and_bakes_to_the_same_ones(scene_file: Path, tmp_path: Path) -> None:
+    lit = tmp_path / "elsewhere" / "lit.blend"
+    lit.parent.mkdir()
+    assert bake_to(tmp_path / "out", scene_file, "--save-blend", str(lit)) == 0
+    assert bpy.data.filepath == str(scene_file)
+    assert not any(group.get("rtgi") for group in bpy.data.node_groups)  # the open scene stays unlit
+    assert [path.name for path in lit.parent.iterdir()] == ["lit.blend"]
+    bpy.ops.wm.open_mainfile(filepath=str(lit))
+    paths = [Path(bpy.path.abspath(image.filepath)).resolve() for image in bpy.data.images if image.get("rtgi")]
+    assert paths == [tmp_path / "out" / map_name("iim", 0, 1)]
+    assert "RTGI" in bpy.data.objects["Floor"].data.uv_layers
+    assert bake_to(tmp_path / "again", lit) == 0
+    assert maps_of(tmp_path / "again") == maps_of(tmp_path / "out")
+
+
+def test_a_lit_scene_that_is_merely_open_is_not_baked(scene_file: Path, tmp_path: Path) -> None:
+    group = bpy.data.node_groups.new("RTGI Light", "ShaderNodeTree")
+    group["rtgi"] = True
+    with pytest.raises(BakeError, match="remove_lightmaps"):
+        bake(BakeJob(frames=[1], out=tmp_path / "out"))
+    assert not (tmp_path / "out").exists()
