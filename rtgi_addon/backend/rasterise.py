@@ -24,6 +24,8 @@ _SPREAD = np.array([0, 10, 7, 13, 2, 8, 5, 15, 11, 1, 12, 6, 9, 3, 14, 4])
 CHUNK_PAIRS = 1 << 20
 #: A pixel that a triangle enters by less than this is not touched: rectangle borders meet the pixel grid by rounding.
 TOUCH_PX = 2e-3
+#: Texels without a covered sub-sample take their point this far from the triangle's edge, towards its middle.
+INSET_PX = 0.25
 #: From this area in pixels on, counted sub-samples give a triangle's area well enough.
 LARGE_PX = 4.0
 #: A triangle whose pixel-space area is below this has no direction in the map.
@@ -213,7 +215,10 @@ def _texels_of_pairs(pairs: _Pairs, corner_px: Float64, island_of_triangle: Int3
     corners = corner_px[pairs.triangle[chosen]]
     # The middle of the covered part may lie on a neighbour; the nearest point of the chosen triangle stands for it.
     point = _nearest_points(point, corners[:, 0], corners[:, 1], corners[:, 2])
-    barycentric = _barycentric(point, corners).astype(np.float32)
+    barycentric = _barycentric(point, corners)
+    # On the very edge of the object a point would touch whatever it stands on: slivers' points are drawn inwards.
+    inward = np.where(samples > 0, 0.0, np.minimum(INSET_PX / np.maximum(_widths(corners), FLAT_AREA_PX), 1.0))[:, None]
+    barycentric = (barycentric * (1 - inward) + inward / 3).astype(np.float32)
     point_triangle, point_barycentric = _points(pixels, owner, corner_px, pairs.triangle[chosen], barycentric)
     smallest = 1.0 / (SUBSAMPLES * SUBSAMPLES)
     # A triangle between the sub-samples still has its area: it counts as a sliver of one. Small triangles' shares are
@@ -262,6 +267,12 @@ def _points(
     place = pixels[:, None] + _subsample_offsets()[sub]
     weights = _barycentric(place.reshape(-1, 2), corner_px[found.reshape(-1)]).reshape(*found.shape, 2)
     return found.astype(np.int32), np.where(some[:, :, None], weights, barycentric[:, None]).astype(np.float32)
+
+
+def _widths(corners: Float64) -> Float64:
+    """(m,) longest side of (m, 3, 2) triangles."""
+    sides = np.roll(corners, -1, axis=1) - corners
+    return np.asarray(np.sqrt(np.einsum("mcx,mcx->mc", sides, sides)).max(axis=1))
 
 
 def _pixel_areas(corner_px: Float64) -> Float64:
