@@ -54,11 +54,11 @@ def evaluate_materials(
     for material, lobe in zip(materials, lobes, strict=True):
         warnings.update({f"material {material.name}: {note}": None for note in lobe.notes if material is not None})
     varies = np.array([m is not None and _varies(m) for m in materials], np.bool_)
-    report("materials", 0, 1 + len(source.meshes))
+    textured = [i for i, m in enumerate(source.meshes) if varies[np.unique(m.material_of_triangle)].any()]
+    report("materials", 0, 1 + len(textured))
     constants = _evaluate_constants(source.material_names, materials, lobes, varies, warnings)
     albedo: list[Float32 | None] = [None] * len(source.meshes)
     emission: list[Float32 | None] = [None] * len(source.meshes)
-    textured = [i for i, m in enumerate(source.meshes) if varies[np.unique(m.material_of_triangle)].any()]
     carried = _read_carried(source, textured) if textured else {}
     for done, index in enumerate(textured):
         report("materials", 1 + done, 1 + len(textured))

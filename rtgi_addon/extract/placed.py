@@ -55,7 +55,7 @@ def placed_meshes(depsgraph: bpy.types.Depsgraph, warn: Callable[[str], None]) -
             continue
         # One object may give several meshes, a curve with geometry nodes for one.
         part = seen[key] = seen.get(key, -1) + 1
-        blocks, receives = light_flags(instance, name, warn)
+        blocks, receives = light_flags(instance, name, depsgraph.view_layer_eval, warn)
         yield Placed((*key, part), name, matrix, obj, obj.data, slot_materials(obj), blocks, receives)
 
 
@@ -82,7 +82,7 @@ def identify(instance: bpy.types.DepsgraphObjectInstance) -> tuple[str, Key]:
 
 
 def light_flags(
-    instance: bpy.types.DepsgraphObjectInstance, name: str, warn: Callable[[str], None]
+    instance: bpy.types.DepsgraphObjectInstance, name: str, layer: bpy.types.ViewLayer, warn: Callable[[str], None]
 ) -> tuple[bool, bool]:
     """(blocks light, receives light). As in Cycles, a ray sees an instance if it sees it and its instancer."""
     carriers = [instance.object] + ([instance.parent] if instance.is_instance else [])
@@ -92,7 +92,7 @@ def light_flags(
         warn(
             f"{name}: hidden from {off} rays but not from {on} rays; it blocks light here, hide both to let light pass"
         )
-    holdout = any(c.is_holdout or c.holdout_get() for c in carriers)
+    holdout = any(c.is_holdout or c.holdout_get(view_layer=layer) for c in carriers)
     return diffuse or shadow, not holdout
 
 

@@ -83,6 +83,8 @@ def _draw(world: bpy.types.World, width: int) -> Float32:
         _answer_light_path(copy.node_tree)
         copy.cycles_visibility.camera = True
         scene.world = copy
+        with bpy.context.temp_override(scene=scene):  # Cycles' own callback looks at the context's world
+            copy.cycles.sampling_method = "NONE"  # a map of lights takes seconds, and only a camera looks here
         _set_camera(scene, blocks)
         radiance = _render(scene, width, None, Path(folder))
         window = _bright_window(radiance)

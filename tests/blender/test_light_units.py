@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 import pytest
 from mathutils import Matrix
+
 from rtgi_addon.backend.scene import AreaShape, Light, LightKind
 from rtgi_addon.extract import extract_source
 
