@@ -35,5 +35,6 @@ def play_pc2(obj: bpy.types.Object, path: Path, frames: Sequence[int]) -> None:
     modifier.interpolation = "LINEAR"
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
-    modifier.frame_start = frames[0]
+    # Blender plays sample frame * frame_scale - frame_start.
     modifier.frame_scale = 1.0 / (frames[1] - frames[0]) if len(frames) > 1 else 1.0
+    modifier.frame_start = frames[0] * modifier.frame_scale
