@@ -149,9 +149,24 @@ def make_bounds(geometry: Geometry) -> Bounds:
         return Bounds(np.zeros(3), np.zeros(3))
     corners = geometry.corners.reshape(-1, 3)
     good = corners[np.isfinite(corners).all(axis=1)]
+    if not len(good):
+        return Bounds(np.zeros(3), np.zeros(3))
     low, high = good.min(axis=0).astype(np.float64), good.max(axis=0).astype(np.float64)
     margin = 1e-4 * float(np.sqrt(((high - low) ** 2).sum()))
     return Bounds(low - margin, high + margin)
+
+
+def grown_bounds(bounds: Bounds, geometry: Geometry) -> Bounds:
+    """``bounds`` itself while it holds all triangles, else a box for both. Sun and sky photons start on the box, so one
+    that stays the same keeps their paths."""
+    now = make_bounds(geometry)
+    if bounds.is_empty or now.is_empty:
+        return now if bounds.is_empty else bounds
+    # The margin of `now` is not demanded: else a scene that only breathes would move the box in every frame.
+    slack = (now.high - now.low).max() * 1e-4
+    if np.all(now.low >= bounds.low - slack) and np.all(now.high <= bounds.high + slack):
+        return bounds
+    return Bounds(np.minimum(bounds.low, now.low), np.maximum(bounds.high, now.high))
 
 
 def photon_counts(sources: Sequence[PhotonSource], total: int) -> dict[int, int]:

@@ -13,6 +13,7 @@ import numpy as np
 
 from .lights import (
     FULL_SPREAD,
+    LampPlace,
     area_points,
     facing_disk,
     half_spread,
@@ -23,7 +24,12 @@ from .lights import (
     to_axes,
 )
 from .sampling import dot, sample_cone, to_frame
-from .scene import Bool, Float32, Float64, Light, LightKind
+from .scene import AreaShape, Bool, Float32, Float64, Light, LightKind
+from .spherical_rectangle import sample_rectangle, see_rectangle
+
+#: An area lamp is near when its area is more than this share of the squared distance. For a rectangle 1/r² then
+#: varies by a third; an ellipse pays with a fifth of its samples, so it waits until that is the lesser evil.
+NEAR_AREA = {AreaShape.RECTANGLE: 0.1, AreaShape.ELLIPSE: 1.0}
 
 
 @dataclass(frozen=True)
@@ -51,13 +57,7 @@ def view_lamp(
         )
     centre = place.position.astype(np.float32) - points  # towards the centre
     if light.kind == LightKind.AREA:
-        towards = centre + area_points(light, place, u, v).astype(np.float32)
-        direction, distance, falloff = _unit(towards, nearest)
-        cosine = -dot(direction, place.axis.astype(np.float32)[None])
-        strength = np.maximum(cosine, 0) * falloff / np.float32(np.pi)
-        if light.spread < FULL_SPREAD:
-            strength *= spread_profile(cosine, half_spread(light))
-        return LampView(direction, distance, strength)
+        return _view_area(light, place, centre, u, v, nearest)
     if light.radius > 0 and not light.soft_falloff:
         direction, distance, strength = _view_sphere(centre, light.radius, u, v)
     else:
@@ -69,6 +69,30 @@ def view_lamp(
         cosine = -dot(direction, place.axis.astype(np.float32)[None])
         strength *= spot_profile(cosine, light.cone, light.blend)
     return LampView(direction, distance, strength.astype(np.float32))
+
+
+def _view_area(light: Light, place: LampPlace, centre: Float32, u: Float32, v: Float32, nearest: Float32) -> LampView:
+    """Far away: points uniform on the lamp. Near: directions uniform in the solid angle of its rectangle, which
+    bounds what one sample can weigh; an ellipse wastes the samples in the rectangle's corners."""
+    direction, distance, falloff = _unit(centre + area_points(light, place, u, v).astype(np.float32), nearest)
+    axis = place.axis.astype(np.float32)[None]
+    cosine = -dot(direction, axis)
+    strength = np.maximum(cosine, 0) * falloff / np.float32(np.pi)
+    near = np.nonzero(light.size[0] * light.size[1] > NEAR_AREA[light.shape] * dot(centre, centre))[0]
+    if len(near):
+        seen = see_rectangle(centre[near], place.x, place.y, light.size)
+        at = sample_rectangle(seen, u[near], v[near])
+        towards = centre[near] + (at[:, :1] * place.x + at[:, 1:] * place.y).astype(np.float32)
+        direction[near], distance[near], _ = _unit(towards, nearest[near])
+        cosine[near] = -dot(direction[near], axis)
+        area, on_lamp = light.size[0] * light.size[1], np.ones(len(near), np.bool_)
+        if light.shape == AreaShape.ELLIPSE:
+            area *= np.pi / 4
+            on_lamp = ((2 * at / np.asarray(light.size)) ** 2).sum(axis=1) <= 1
+        strength[near] = np.where(on_lamp & (cosine[near] > 0), seen.solid_angle / (np.pi * area), 0)
+    if light.spread < FULL_SPREAD:
+        strength *= spread_profile(cosine, half_spread(light))
+    return LampView(direction, distance, strength)
 
 
 def _view_sphere(centre: Float32, radius: float, u: Float32, v: Float32) -> tuple[Float32, Float32, Float32]:

@@ -124,31 +124,46 @@ def _rotation(light: Int32, dimension: int, seed: int) -> UInt32:
 
 
 @lru_cache(maxsize=32)
-def _sobol_pairs(count: int) -> UInt32:
-    """(2^k >= count, 2) the (0, 2)-sequence: van der Corput and Sobol's second dimension, fixed point."""
-    size = 1 << max(count - 1, 0).bit_length()
-    index = np.arange(size, dtype=np.uint32)
-    first, second = np.zeros(size, np.uint32), np.zeros(size, np.uint32)
+def _sobol_pairs(count: int) -> tuple[int, UInt32, UInt32]:
+    """(k, (count,), (2^k,)): the first ``count`` <= 2^k points of van der Corput's sequence, fixed point, and Sobol's
+    second dimension by the upper k bits of the first."""
+    bits = max(count - 1, 0).bit_length()
+    index = np.arange(1 << bits, dtype=np.uint32)
+    first, second = np.zeros(len(index), np.uint32), np.zeros(len(index), np.uint32)
     direction = 1 << 31
     for bit in range(32):
         on = (index >> np.uint32(bit)) & np.uint32(1)
         first |= on << np.uint32(31 - bit)
         second ^= on * np.uint32(direction)
         direction ^= direction >> 1
-    return np.stack([first, second], axis=1)
+    return bits, first[:count], second[np.argsort(first)]
+
+
+def _nested_shuffle(bits: UInt32, key: UInt32) -> UInt32:
+    """A permutation in which each bit depends on the lower ones alone (Laine and Karras 2011, Burley 2020 §4)."""
+    bits = bits ^ bits * np.uint32(0x3D20ADEA)
+    bits = (bits + key) * ((key >> np.uint32(16)) | np.uint32(1))
+    bits ^= bits * np.uint32(0x05526C56)
+    bits ^= bits * np.uint32(0x53A22864)
+    return bits
 
 
 def stratified_pair(key: UInt32, count: int, *, pair: int, seed: int = 0) -> tuple[UInt32, UInt32]:
     """(n, count), (n, count) fixed-point points of the square: ``count`` stratified ones for each of n keys.
 
-    A (0, 2)-sequence, digit-scrambled per key; each ``pair`` runs through it in another order, so several pairs
-    together fill the space of more dimensions (padding; Kollig and Keller 2002).
+    A (0, 2)-sequence, digit-scrambled per key. Each ``pair`` runs through it in an order of its own, so that several
+    pairs together fill the space of more dimensions (padding; Burley 2020 §5).
     """
-    points = _sobol_pairs(count)
-    order = hash_keys(key, 3 * pair, seed) & np.uint32(len(points) - 1)
-    at = np.arange(count, dtype=np.uint32)[None, :] ^ order[:, None]
-    x = points[:, 0].take(at) ^ hash_keys(key, 3 * pair + 1, seed)[:, None]
-    y = points[:, 1].take(at) ^ hash_keys(key, 3 * pair + 2, seed)[:, None]
+    bits, first, second = _sobol_pairs(count)
+    if bits == 0:
+        slot = np.zeros((len(key), 1), np.uint32)
+        x = slot
+    else:
+        low = np.uint32(32 - bits)
+        slot = _nested_shuffle(first[None, :], hash_keys(key, 3 * pair, seed)[:, None]) >> low
+        x = slot << low
+    x = x ^ hash_keys(key, 3 * pair + 1, seed)[:, None]
+    y = second.take(slot) ^ hash_keys(key, 3 * pair + 2, seed)[:, None]
     return x, y
 
 

@@ -10,11 +10,12 @@ import pytest
 from scipy import integrate, stats
 
 from rtgi_addon.backend import lights as lt
-from rtgi_addon.backend.emission import MESHES, SKY, make_bounds, make_sources, photon_counts
+from rtgi_addon.backend.emission import MESHES, SKY, grown_bounds, make_bounds, make_sources, photon_counts
 from rtgi_addon.backend.geometry import Geometry
 from rtgi_addon.backend.lamp_view import may_see, view_lamp
 from rtgi_addon.backend.sampling import photon_numbers, unit_float64
 from rtgi_addon.backend.scene import AreaShape, Instance, Light, LightKind, Material, Scene, World
+from rtgi_addon.backend.spherical_rectangle import pdf_rectangle, sample_rectangle, see_rectangle
 from tests.backend.scenes import box, constant_sky, quad, translation
 
 ORIGIN = np.array([3.0, -2.0, 1.0])
@@ -321,3 +322,53 @@ def test_lamp_in_front_of_nothing_and_on_the_point_itself() -> None:
         light, zero, zero[:, 0], zero[:, 0], origin=np.zeros(3), nearest=np.full(3, 1e-3, np.float32), far=1
     )
     assert np.isfinite(view.strength).all() and np.isfinite(view.direction).all()
+
+
+def test_spherical_rectangle_is_uniform_in_solid_angle() -> None:
+    """Its solid angle has a closed form on the axis, and its points make the mean of any function of direction."""
+    x, y = np.eye(3)[:2]
+    count = 40_000
+    u, v, *_ = numbers(count)
+    for distance in (0.05, 1.0, 20.0):
+        on_axis = see_rectangle(np.array([[0.0, 0.0, distance]]), x, y, (2.0, 2.0))
+        expected = 4 * np.arcsin(1 / (1 + distance**2))
+        assert on_axis.solid_angle[0] == pytest.approx(expected, rel=1e-6)
+        assert pdf_rectangle(on_axis)[0] == pytest.approx(1 / expected, rel=1e-6)
+    centre = np.array([0.4, -0.9, 0.3])
+    seen = see_rectangle(np.tile(centre, (count, 1)), x, y, (2.0, 1.0))
+    at = sample_rectangle(seen, u, v)
+    assert np.abs(at[:, 0]).max() <= 1 + 1e-9 and np.abs(at[:, 1]).max() <= 0.5 + 1e-9
+    grid = (np.arange(500) + 0.5) / 500 - 0.5
+    gx, gy = (g.ravel() for g in np.meshgrid(grid * 2, grid))
+    towards = centre + np.stack([gx, gy, 0 * gx], axis=1)
+    squared = (towards**2).sum(axis=1)
+    weight = 0.3 / squared**1.5  # solid angle of each cell, to a factor
+    assert seen.solid_angle[0] == pytest.approx(weight.mean() * 2.0, rel=1e-3)
+    for function in (lambda a, b: a, lambda a, b: b * b, lambda a, b: (a > 0.3) * 1.0, lambda a, b: a * b):
+        mean = (function(gx, gy) * weight).sum() / weight.sum()
+        assert function(at[:, 0], at[:, 1]).mean() == pytest.approx(mean, abs=2e-3)
+
+
+@pytest.mark.parametrize("shape", list(AreaShape))
+def test_no_sample_of_a_near_area_lamp_weighs_more_than_its_half_space(shape: AreaShape) -> None:
+    light = Light("area", LightKind.AREA, translation(0, 0, 0), (1.0, 1.0, 1.0), size=(1.0, 1.0), shape=shape)
+    rng = np.random.default_rng(2)
+    points = (rng.random((5000, 3)) - (0.5, 0.5, 1.0)) * (1.2, 1.2, 0.3)
+    u, v = rng.random((2, 5000)).astype(np.float32)
+    near = np.full(5000, 1e-6, np.float32)
+    view = view_lamp(light, points.astype(np.float32), u, v, origin=np.zeros(3), nearest=near, far=1)
+    area = 1.0 if shape == AreaShape.RECTANGLE else np.pi / 4
+    assert view.strength.max() <= 2 * np.pi / (np.pi * area) * (1 + 1e-6)
+
+
+def test_bounds_grow_only_when_they_must() -> None:
+    scene = Scene((box("b", (1, 1, 1), texels=2),), (Instance("b", 0, np.eye(4), moving=True),), (Material("m"),))
+    state = scene.first_frame()
+    geometry = Geometry(scene, state)
+    bounds = make_bounds(geometry)
+    assert grown_bounds(bounds, geometry) is bounds
+    geometry.update(replace(state, matrix_world=np.array([translation(2, 0, 0)])))
+    grown = grown_bounds(bounds, geometry)
+    assert grown.low[0] == bounds.low[0] and grown.high[0] == pytest.approx(2.5, abs=1e-3)
+    geometry.update(state)
+    assert grown_bounds(grown, geometry) is grown
