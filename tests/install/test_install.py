@@ -97,18 +97,30 @@ def test_tests_run_the_versions_that_are_shipped() -> None:
             assert version(project) == pinned
 
 
+def packages_of_blender(folder: Path) -> Path:
+    """What Blender brings to Python: this environment's packages without those that the extension ships."""
+    folder.mkdir()
+    shipped = {Path(wheel).name.split("-")[0] for wheel in MANIFEST["wheels"]}
+    for entry in Path(importlib.util.find_spec("bpy").origin).parents[1].iterdir():
+        if re.split(r"[-.]", entry.name)[0] not in shipped:
+            (folder / entry.name).symlink_to(entry)
+    return folder
+
+
 def test_installed_extension_bakes_and_leaves_nothing_behind(built: Path, tmp_path: Path) -> None:
     result, user = tmp_path / "seen.json", tmp_path / "user"
     user.mkdir()
+    packages = packages_of_blender(tmp_path / "packages")
     done = run(
         sys.executable,
+        "-S",  # not the environment's packages, but those of PYTHONPATH
         Path(__file__).with_name("child.py"),
         built,
         MODULE,
         tmp_path / "scene.blend",
         result,
         cwd=tmp_path,
-        env=os.environ | {"BLENDER_USER_RESOURCES": str(user)},
+        env=os.environ | {"BLENDER_USER_RESOURCES": str(user), "PYTHONPATH": str(packages)},
     )
     seen = json.loads(result.read_text())
     output = done.stdout + done.stderr
