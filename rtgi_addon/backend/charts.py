@@ -125,7 +125,7 @@ def _generate(atlas: xatlas.Atlas, *, texels_per_unit: float, padding: int) -> F
     options = xatlas.PackOptions()
     options.texels_per_unit = texels_per_unit
     options.padding = padding
-    options.bilinear = False
+    options.bilinear = True  # else slanted borders may touch where padding is 0
     options.create_image = False
     atlas.generate(xatlas.ChartOptions(), options)
     _, indices, uv = atlas.get_mesh(0)
