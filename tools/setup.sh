@@ -5,13 +5,14 @@
 set -eu
 cd "$(dirname "$0")/.."
 
-# Print a Python of version $1 that starts. A pyenv shim on PATH may refuse to, so its versions are tried by folder.
+# Print a Python of version $1 that starts and can import $2. A pyenv shim on PATH may refuse to start, so its versions
+# are tried by folder too.
 find_python() {
     for python in "python$1" python3 python \
         "${PYENV_ROOT:-$HOME/.pyenv}/versions/$1".*/bin/python \
         "$HOME/.local/share/uv/python/cpython-$1".*/bin/python \
         /usr/local/bin/python"$1" /usr/bin/python"$1" /opt/homebrew/bin/python"$1"; do
-        version=$("$python" -c 'import sys, venv; print("%d.%d" % sys.version_info[:2])' 2>/dev/null </dev/null) || continue
+        version=$("$python" -c "import sys, $2; print('%d.%d' % sys.version_info[:2])" 2>/dev/null </dev/null) || continue
         if [ "$version" = "$1" ]; then
             echo "$python"
             return 0
@@ -31,7 +32,8 @@ case ${2:-any} in
         ;;
 esac
 for pair in $wanted; do
-    if python=$(find_python "${pair%:*}"); then
+    # Debian's own Python may lack ensurepip, which setup.py sees to; any other is better then.
+    if python=$(find_python "${pair%:*}" ensurepip || find_python "${pair%:*}" venv); then
         exec "$python" tools/setup.py "$folder" "requirements/bpy-${pair#*:}.txt"
     fi
 done
