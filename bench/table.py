@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What the bench runs: scenes and methods. To add one, add a row."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+from pathlib import Path
+
+from rtgi_addon.backend.settings import Quality
+
+ROOT = Path(__file__).parents[1]
+#: Errors at which times are compared.
+TARGETS = (0.04, 0.02)
+#: RTGI is to reach the first of them so much sooner than Cycles + OIDN.
+HELD_TO = 25.0
+
+#: Texels that are surface by less are not compared: Cycles bakes only pixels whose centre is surface, and fills the
+#: others from their neighbours.
+LEAST_WHOLE = 0.5
+
+
+@dataclass(frozen=True)
+class BenchScene:
+    """A scene with a stored reference. All its materials must be uniform: the Cycles bake joins its meshes."""
+
+    name: str
+    title: str
+
+    @property
+    def blend(self) -> Path:
+        return ROOT / "demo_blend" / f"{self.name}.blend"
+
+    @property
+    def reference(self) -> Path:
+        return ROOT / "tests" / "reference" / f"{self.name}.npz"
+
+
+class Curve(StrEnum):
+    """Methods that differ in sample count alone; one line of the plot."""
+
+    OURS = "RTGI"
+    OURS_DENOISED = "RTGI + OIDN"
+    CYCLES = "Cycles"
+    CYCLES_DENOISED = "Cycles + OIDN"
+
+
+@dataclass(frozen=True)
+class Method:
+    """One point of a curve; ``setting`` is a quality of RTGI or Cycles' samples per texel."""
+
+    setting: Quality | int
+    seeds: int
+
+    @property
+    def label(self) -> str:
+        return f"{self.setting} spp" if isinstance(self.setting, int) else str(self.setting)
+
+
+SCENES = (BenchScene("cornell", "Cornell box"),)
+OURS = (Method(Quality.DRAFT, 5), Method(Quality.PREVIEW, 5), Method(Quality.FINAL, 5))
+CYCLES = (Method(16, 5), Method(64, 5), Method(256, 5), Method(1024, 3))
+#: With --full, so that Cycles' curves reach the lower errors.
+CYCLES_FULL = (*CYCLES, Method(4096, 2))

@@ -1,0 +1,125 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""One engine in a process of its own, so that its memory is its own and each engine has its Blender.
+
+The parent sends (method, seed); the worker answers with a Run per curve.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Any
+
+from rtgi_addon.backend.denoise import MapDenoiser
+from rtgi_addon.backend.oidn import Denoiser, find_oidn
+from rtgi_addon.backend.scene import Bool, Float32, Int32
+from rtgi_addon.backend.session import FrameResult, Session
+from rtgi_addon.backend.settings import BakeSettings, Quality
+from rtgi_addon.backend.texels import Texels
+from rtgi_addon.environment import device, library_folders, versions
+
+from .cycles_bake import CyclesBake
+from .errors import Errors, compare
+from .measure import Cost, Meter
+from .prepare import Prepared, prepare, texel_table
+from .reference import Reference, load_reference, match
+from .results import Run
+from .table import LEAST_WHOLE, BenchScene, Curve
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A prepared scene and the texels that are compared."""
+
+    prepared: Prepared
+    texels: Texels
+    reference: Reference
+    compared: Bool  # (r,) of the reference's texels
+    texel: Int32  # (r,) of the bake
+
+    def errors(self, values: Float32) -> Errors:
+        """Of ``values`` (n, 3) on all texels."""
+        rows, r = self.compared, self.reference
+        return compare(values[self.texel[rows]], r.mean[rows], r.standard_error[rows])
+
+
+def make_subject(scene: BenchScene) -> Subject:
+    reference = load_reference(scene.reference)
+    prepared = prepare(scene.blend, reference.made["resolution"])
+    texels, table = texel_table(prepared)
+    # Of a texel that is partly under another object, or mostly beside its surface, methods mean different parts.
+    compared = (reference.open >= 1.0) & (reference.whole >= LEAST_WHOLE)
+    return Subject(prepared, texels, reference, compared, match(reference, table))
+
+
+def _hello(subject: Subject) -> dict[str, Any]:
+    """What the parent needs to know, which does not import bpy itself."""
+    return {"compared": subject.compared, "device": device(0), "versions": versions()}
+
+
+def serve_ours(connection: Connection, scene: BenchScene) -> None:
+    subject, meter = make_subject(scene), Meter()
+    _bake(subject, meter, Quality.DRAFT, seed=99, denoise=True)  # libraries are loaded and warm, as Cycles' are
+    connection.send(_hello(subject))
+    _serve(connection, lambda quality, seed: _run_ours(subject, meter, quality, seed))
+
+
+def _run_ours(subject: Subject, meter: Meter, quality: Quality, seed: int) -> list[Run]:
+    runs = []
+    for curve, denoise in ((Curve.OURS, False), (Curve.OURS_DENOISED, True)):
+        result, cost = _bake(subject, meter, quality, seed=seed, denoise=denoise)
+        if result.stats.warnings:
+            raise RuntimeError("; ".join(result.stats.warnings))
+        maps = result.maps
+        page = maps.iim if maps.caustics is None else maps.iim + maps.caustics
+        t = subject.texels
+        errors = subject.errors(page[t.page, t.row, t.col])
+        runs.append(Run(curve, str(quality), seed, cost, errors, result.stats.estimated_error))
+    return runs
+
+
+def _bake(subject: Subject, meter: Meter, quality: Quality, *, seed: int, denoise: bool) -> tuple[FrameResult, Cost]:
+    """All that a bake does after extraction, from a new session to its maps."""
+    p = subject.prepared
+    settings = BakeSettings(quality=quality, seed=seed, denoise=denoise, resolution=p.atlas.resolution)
+
+    def work() -> FrameResult:
+        with Session(p.scene, p.atlas, settings, p.first, oidn_paths=library_folders()) as session:
+            return session.advance(p.first)
+
+    return meter.measured(work)
+
+
+def serve_cycles(connection: Connection, scene: BenchScene) -> None:
+    subject = make_subject(scene)
+    library = find_oidn(library_folders())
+    if library is None:
+        raise RuntimeError(f"no Open Image Denoise in {library_folders()}")
+    meter = Meter()
+    baker = CyclesBake(subject.prepared, subject.texels, meter)
+    with Denoiser(library) as oidn:
+        denoiser = MapDenoiser(oidn, subject.texels.index, subject.texels.surface)
+        denoiser.denoise(baker.run(4, 99)[0])
+        connection.send(_hello(subject))
+        _serve(connection, lambda samples, seed: _run_cycles(subject, meter, baker, denoiser, samples, seed))
+
+
+def _run_cycles(
+    subject: Subject, meter: Meter, baker: CyclesBake, denoiser: MapDenoiser, samples: int, seed: int
+) -> list[Run]:
+    values, cost = baker.run(samples, seed)
+    filtered, extra = meter.measured(lambda: denoiser.denoise(values))
+    peaks = [c.peak_bytes for c in (cost, extra) if c.peak_bytes is not None]
+    both = Cost(cost.seconds + extra.seconds, max(peaks, default=None))
+    label = f"{samples} spp"
+    return [
+        Run(Curve.CYCLES, label, seed, cost, subject.errors(values)),
+        Run(Curve.CYCLES_DENOISED, label, seed, both, subject.errors(filtered)),
+    ]
+
+
+def _serve(connection: Connection, run: Callable[..., list[Run]]) -> None:
+    """Answer until the parent sends None."""
+    while (asked := connection.recv()) is not None:
+        connection.send(run(*asked))
