@@ -37,5 +37,6 @@ for pair in $wanted; do
         exec "$python" tools/setup.py "$folder" "requirements/bpy-${pair#*:}.txt"
     fi
 done
-echo "setup: no Python found for Blender ${2:-5.0 or 5.2} (Python:Blender $wanted); install one, for example: apt-get install python3.11 python3.11-venv" >&2
+first=${wanted%%:*}
+echo "setup: no Python for Blender ${2:-5.0 or 5.2}; install one, for example: apt-get install python$first python$first-venv" >&2
 exit 3
