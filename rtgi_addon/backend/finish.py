@@ -62,9 +62,14 @@ class Finisher:
         source = nearest_valid(self._texels, valid)
         return np.where((source >= 0)[:, None], values[source], np.float32(0))
 
-    def denoise(self, values: Float32) -> Float32:
-        """``values`` (n, 3) filtered, or as they are where there is no denoiser."""
-        return values if self._denoiser is None else self._denoiser.denoise(np.maximum(values, 0))
+    def denoise(self, values: Float32, valid: Bool) -> Float32:
+        """``values`` (n, 3) filtered; texels that are not ``valid`` get what the filter makes of their surroundings.
+
+        Where there is no denoiser they are only filled.
+        """
+        if self._denoiser is None:
+            return self.fill(values, valid)
+        return self._denoiser.denoise(np.maximum(values, 0), valid=valid)
 
     def close_seams(self, values: Float32) -> Float32:
         """``values`` (n, 3) matched along the cuts through smooth surfaces, or as they are when not asked for."""

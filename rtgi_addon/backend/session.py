@@ -166,8 +166,8 @@ class Session:
             end = self._finisher
             known = placed.emitted.copy()
             known[: self.texels.count] += placed.albedo * light.aim
-            iim = end.denoise(end.fill(light.iim, links.valid))
-            half = end.denoise(end.fill(links.irradiance(known, half=0), links.valid))
+            iim = end.denoise(light.iim, links.valid)
+            half = end.denoise(links.irradiance(known, half=0), links.valid)
         return _Lit(placed.state.frame, samples, light.aim, iim, links.valid, noise_estimate(iim, half))
 
     # --- stages ---------------------------------------------------------------------------------------------------

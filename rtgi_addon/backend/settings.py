@@ -88,7 +88,7 @@ class BakeSettings:
     caustics: Caustics = _setting(Caustics.AUTO, "light that reaches a wall by mirror or glass")
     aim_direct: AimDirect = _setting(AimDirect.SHADOW_RAYS, "direct part of the AIM")
     aim_bounced: AimBounced = _setting(AimBounced.AUTO, "bounced part of the AIM")
-    direct_samples: int = _setting(4, "shadow rays per texel and lamp", 1, 4096)
+    direct_samples: int = _setting(8, "shadow rays per texel and lamp; 8 use each of a texel's points once", 1, 4096)
     photons: int = _setting(100_000, "photons emitted per frame, shared by the lights by their flux", 1, 100_000_000)
     nearest_photons: int = _setting(64, "photons in one irradiance estimate (k)", 4, 1024)
     max_bounces: int = _setting(64, "longest photon path", 1, 1024)

@@ -158,7 +158,7 @@ def cornell(texels: int = 44, *, moving: bool = False) -> tuple[Scene, Atlas]:
         matrix[:2, :2] = [[c, -s_], [s_, c]]
         return matrix
 
-    matrices = [np.eye(4)] * 5 + [turned(-0.29, 0.35, -0.35, 0.3001), turned(0.3, -0.35, 0.3, 0.6001)]
+    matrices = [np.eye(4)] * 5 + [turned(-0.29, 0.35, -0.35, 0.3), turned(0.3, -0.35, 0.3, 0.6)]
     meshes = (*walls, *blocks)
     instances = tuple(
         Instance(m.name, i, matrices[i], moving=moving and m.name == "short") for i, m in enumerate(meshes)
