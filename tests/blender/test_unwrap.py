@@ -3,8 +3,12 @@
 
 from __future__ import annotations
 
+import hashlib
+import subprocess
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import bmesh
 import bpy
@@ -243,6 +247,38 @@ def test_same_mesh_same_layout(build: Builder) -> None:
     first, second = unwrap(source)[0], unwrap(source)[0]
     assert np.array_equal(first.corner_uv, second.corner_uv) and first.size == second.size
     assert np.array_equal(first.island_of_triangle, second.island_of_triangle)
+
+
+CHILD = """
+import hashlib, os, sys
+import bpy
+import numpy as np
+from rtgi_addon.source import SourceMesh
+from rtgi_addon.unwrap import unwrap
+if hasattr(os, "sched_setaffinity"):
+    os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+arrays = dict(np.load(sys.argv[1]))
+mesh = SourceMesh(name="m", rtgi_uv=None, **arrays)
+digest = hashlib.sha256()
+for time_limit in (0.0, 0.3):
+    digest.update(unwrap(mesh, time_limit=time_limit)[0].corner_uv.tobytes())
+sys.stderr.write(digest.hexdigest())
+sys.stderr.flush()
+os._exit(0)
+"""
+
+
+def test_same_layout_in_another_process_on_one_core(tmp_path: Path) -> None:
+    source = source_of(monkey())
+    names = ("vertices", "triangles", "corner_normals", "loop_of_corner", "polygon_of_triangle", "material_of_triangle")
+    np.savez(tmp_path / "mesh.npz", **{name: getattr(source, name) for name in names})
+    digest = hashlib.sha256()
+    for time_limit in (0.0, 0.3):
+        digest.update(unwrap(source, time_limit=time_limit)[0].corner_uv.tobytes())
+    command = [sys.executable, "-c", CHILD, str(tmp_path / "mesh.npz")]
+    root = Path(__file__).parents[2]
+    child = subprocess.run(command, cwd=root, capture_output=True, text=True, timeout=120, check=True)
+    assert child.stderr.endswith(digest.hexdigest())
 
 
 @pytest.mark.parametrize("scale", [1e-4, 1e4])
