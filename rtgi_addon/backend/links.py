@@ -31,8 +31,9 @@ from .texels import BACK, TexelFrame, Texels
 from .tracing import Hits, Tracer
 
 NO_TARGET = -1
-#: A texel most of whose rays start inside other geometry is under it: not valid, filled from its neighbours.
-LEAST_FREE_SHARE = 0.25
+#: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
+#: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
+LEAST_FREE_SHARE = 0.75
 
 
 @dataclass(frozen=True)
@@ -95,6 +96,7 @@ class TracedLinks:
     target: Int32  # (m, K)
     weight: Float32  # (m, K)
     usable: Bool  # (m, K) False: the ray starts inside geometry, or leaves below the surface
+    free: Float32  # (m,) share of the cosine rays from the texel's open part that do not end on a dark side
     beyond_row: Int32  # (b,) texel
     beyond_target: Int32  # (b,)
     beyond_weight: Float32  # (b, 3)
@@ -105,6 +107,18 @@ class TracedLinks:
         names = [f.name for f in fields(TracedLinks) if f.name != "rays"]
         columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
         return TracedLinks(**columns, rays=sum(p.rays for p in parts))
+
+
+@dataclass(frozen=True)
+class _Fan:
+    """The cosine rays of m texels, c each."""
+
+    start: Int32  # (m, c) which of the texel's points
+    directions: Float32  # (m, c, 3)
+    target: Int32  # (m, c)
+    weight: Float32  # (m, c)
+    dark: Bool  # (m, c) ended on a side without a map
+    below: Bool  # (m, c) leaves below the texel's own triangle
 
 
 class LinkTracer:
@@ -132,21 +146,54 @@ class LinkTracer:
         """The links of texels first..stop-1."""
         rows = slice(first, stop)
         pattern = pattern_of_texels(first, stop, self._seed)
-        columns, hits, directions = self._cosine(rows, pattern)
-        parts, rays = [columns], columns[0].size
+        fan, hits = self._cosine(rows, pattern)
+        opened, tested = self._open_points(rows, fan)
+        from_open = np.take_along_axis(opened, fan.start, axis=1)
+        usable = ~(fan.dark | fan.below) & from_open
+        free = (from_open & ~fan.dark).sum(axis=1) / np.maximum(from_open.sum(axis=1), 1)
+        target, weight, rays = fan.target, fan.weight, fan.target.size + tested
         if self._n_bright:
-            aimed, cast = self._aimed(rows, pattern)
-            parts.append(aimed)
+            start, aim, aimed, cast = self._aimed(rows, pattern)
+            target, weight = np.concatenate([target, aim], axis=1), np.concatenate([weight, aimed], axis=1)
+            usable = np.concatenate([usable, np.take_along_axis(opened, start, axis=1)], axis=1)
             rays += cast
-        target, weight, usable = (np.concatenate(column, axis=1) for column in zip(*parts, strict=True))
-        row, beyond, throughput, cast = self._beyond(first, hits, columns[0].reshape(-1), directions)
-        return TracedLinks(target, weight, usable, row, beyond, throughput, rays + cast)
+        row, beyond, throughput, cast = self._beyond(first, hits, fan.target.reshape(-1), fan.directions.reshape(-1, 3))
+        return TracedLinks(
+            target, weight, usable, free.astype(np.float32), row, beyond, throughput, rays + cast
+        )  # fmt: skip
+
+    def _open_points(self, rows: slice, fan: _Fan) -> tuple[Bool, int]:
+        """((m, POINTS) which points belong to the texel's open part, rays cast).
+
+        A texel that another surface cuts through has points on both its sides; those behind it see the void or dark
+        sides. Points that cannot see each other along the surface lie on different sides; the side whose rays end on
+        dark sides least is the open one.
+        """
+        opened = np.ones((len(fan.dark), POINTS), np.bool_)
+        cut = np.nonzero(fan.dark.any(axis=1))[0]
+        if not len(cut):
+            return opened, 0
+        of_point = fan.start[cut][:, :, None] == np.arange(POINTS)  # (k, c, POINTS)
+        dark = (of_point & fan.dark[cut][:, :, None]).sum(axis=1)
+        cast = np.maximum(of_point.sum(axis=1), 1)
+        anchor = np.argmin(dark / cast, axis=1)
+        points = self._frame.points[rows][cut]
+        origins = np.repeat(points[np.arange(len(cut)), anchor], POINTS, axis=0)
+        ways = points.reshape(-1, 3) - origins
+        hidden = self._tracer.occluded(origins, ways, np.ones(len(ways), np.float32)).reshape(-1, POINTS)
+
+        def darkness(chosen: Bool) -> Float64:
+            return np.asarray((dark * chosen).sum(axis=1) / np.maximum((cast * chosen).sum(axis=1), 1))
+
+        other_side = (darkness(hidden) < darkness(~hidden)) & hidden.any(axis=1)
+        opened[cut] = np.where(other_side[:, None], hidden, ~hidden)
+        return opened, len(ways)
 
     def _starts(self, rows: slice, start: Int32) -> Float32:
         """(m, c, 3) ray origins: the points ``start`` (m, c) of each texel."""
         return np.take_along_axis(self._frame.points[rows], start[:, :, None], axis=1)
 
-    def _cosine(self, rows: slice, pattern: Int32) -> tuple[tuple[Int32, Float32, Bool], Hits, Float32]:
+    def _cosine(self, rows: slice, pattern: Int32) -> tuple[_Fan, Hits]:
         table = cosine_patterns(self._samples.cosine, self._seed)
         local = table.directions[pattern]  # (m, c, 3)
         axes = np.stack([self._tangents[0][rows], self._tangents[1][rows], self._frame.normal[rows]], axis=1)
@@ -165,9 +212,13 @@ class LinkTracer:
         n_c, n_b = np.float32(self._samples.cosine), np.float32(self._n_bright)
         weight = 1 / (n_c + n_b * np.float32(np.pi) * density.reshape(shape) / cosine)
         below = np.einsum("mcj,mj->mc", directions, self._frame.geometric_normal[rows]) <= 0
-        return (target.reshape(shape), weight, ~(dark_side.reshape(shape) | below)), hits, flat_directions
+        fan = _Fan(
+            table.start[pattern], directions, target.reshape(shape), weight, dark_side.reshape(shape), np.asarray(below)
+        )
+        return fan, hits
 
-    def _aimed(self, rows: slice, pattern: Int32) -> tuple[tuple[Int32, Float32, Bool], int]:
+    def _aimed(self, rows: slice, pattern: Int32) -> tuple[Int32, Int32, Float32, int]:
+        """((m, b) start point, (m, b) target, (m, b) weight, rays cast) of the aimed samples."""
         table = bright_patterns(self._samples.bright, self._seed)
         points, normals, target_table = self._aims()
         target = target_table[pattern]  # (m, b)
@@ -188,7 +239,7 @@ class LinkTracer:
         ends = np.where(is_sky, np.float32(np.inf), np.float32(1)).reshape(-1)[at]
         hidden = self._tracer.occluded(origins.reshape(-1, 3)[at], ways.reshape(-1, 3)[at], ends)
         weight.reshape(-1)[at[hidden]] = 0
-        return (target, weight.astype(np.float32), np.ones(weight.shape, np.bool_)), len(at)
+        return table.start[pattern], target, weight.astype(np.float32), len(at)
 
     def _beyond(self, first: int, hits: Hits, target: Int32, directions: Float32) -> tuple[Int32, Int32, Float32, int]:
         """((b,) texel, (b,) target, (b, 3) weight, rays): where rays go on from surfaces that pass them."""
@@ -265,12 +316,11 @@ def trace_links(
         empty = sparse.csr_matrix((0, target_count), dtype=np.float32)
         return Links(empty, (empty, empty), (), np.zeros(0, np.bool_), 0)
     traced = TracedLinks.join(parts)
-    free = traced.usable[:, : samples.cosine].mean(axis=1)
     weight = traced.weight * traced.usable
     first = _first_half(weight.shape[1], samples)
     matrices = [_matrix(traced.target, weight, columns, target_count) for columns in (slice(None), first, ~first)]
     beyond = _beyond_matrices(traced, weight, target_count) if len(traced.beyond_row) else ()
-    return Links(matrices[0], (matrices[1], matrices[2]), beyond, free >= LEAST_FREE_SHARE, traced.rays)
+    return Links(matrices[0], (matrices[1], matrices[2]), beyond, traced.free >= LEAST_FREE_SHARE, traced.rays)
 
 
 def _beyond_matrices(traced: TracedLinks, weight: Float32, target_count: int) -> tuple[sparse.csr_matrix, ...]:

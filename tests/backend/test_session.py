@@ -158,9 +158,7 @@ def test_what_a_mirror_shows_lights_like_its_image():
 def test_light_through_a_pane(pane, share):
     scene, _ = glowing_square_and_receiver([(0, 1, 1), (1, 1, 1), (1, 0, 1), (0, 0, 1)])
     sheet = scenes.quad("pane", [(-9, -9, 0.5), (9, -9, 0.5), (9, 9, 0.5), (-9, 9, 0.5)], material=2)
-    scene = Scene(
-        (*scene.meshes, sheet), (*scene.instances, Instance("pane", 2, np.eye(4))), (*scene.materials, pane)
-    )
+    scene = Scene((*scene.meshes, sheet), (*scene.instances, Instance("pane", 2, np.eye(4))), (*scene.materials, pane))
     atlas = scenes.grid_atlas(scene, [(16, 16), (16, 16), (4, 4)])
     iim, _, instance, _, _ = bake(scene, atlas, replace(BARE, quality=Quality.FINAL))
     expected = np.pi * 0.199825 * np.ones(3) * share
@@ -235,9 +233,7 @@ def test_counts_are_what_the_settings_say():
 
 def test_target_error_is_met_by_its_own_estimate_and_in_truth():
     scene, atlas = scenes.cornell(16)
-    truth = np.mean(
-        [bake(scene, atlas, replace(BARE, quality=Quality.FINAL, seed=s))[0] for s in range(8, 16)], axis=0
-    )
+    truth = np.mean([bake(scene, atlas, replace(BARE, quality=Quality.FINAL, seed=s))[0] for s in range(8, 16)], axis=0)
     iim, _, _, _, result = bake(scene, atlas, replace(BARE, target_error=0.05))
     assert result.stats.estimated_error <= 0.05
     assert np.sqrt(np.mean((iim - truth) ** 2)) / truth.mean() <= 0.05 * 1.5
@@ -252,5 +248,3 @@ def test_scenes_with_nothing_to_light():
     scene = Scene((one,), (Instance("one", 0, np.eye(4)),), (scenes.WHITE,))
     iim, aim, _, _, _ = bake(scene, scenes.grid_atlas(scene, [(1, 1)]))
     assert len(iim) == 1 and not iim.any() and not aim.any()
-
-
