@@ -28,7 +28,7 @@ from .tracing import EmbreeTracer, Hits, Tracer
 
 #: Rays of all sides together, and of one side at least and at most (powers of two).
 TOTAL_RAYS = 1 << 18
-RAYS_OF_SIDE = (128, 1024)
+RAYS_OF_SIDE = (128, 256)
 #: Rays over all states together, about, and the states that are looked at whatever it costs.
 MOST_RAYS = 1 << 22
 LEAST_STATES = 16
