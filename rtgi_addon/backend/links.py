@@ -33,7 +33,7 @@ from .tracing import Hits, Tracer
 NO_TARGET = -1
 #: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
 #: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
-LEAST_FREE_SHARE = 0.75
+LEAST_FREE_SHARE = 0.9
 
 
 @dataclass(frozen=True)
