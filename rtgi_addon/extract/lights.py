@@ -15,7 +15,7 @@ import numpy as np
 
 from ..backend.scene import AreaShape, Float64, Light, LightKind
 from . import nodes
-from .placed import LIGHT_RAYS, placed_lights
+from .placed import placed_lights
 
 Warn = Callable[[str], None]
 RGB = tuple[float, float, float]
@@ -37,7 +37,7 @@ def light_of(obj: bpy.types.Object, name: str, matrix: Float64, warn: Warn) -> L
     lamp = obj.data
     _tell_unfollowed(obj, name, warn)
     power = _colour_strength(lamp, name, warn)
-    if not all(getattr(obj, flag) for flag in LIGHT_RAYS[:1]):
+    if not obj.visible_diffuse:
         power = np.zeros(3)
     common = {
         "name": name,

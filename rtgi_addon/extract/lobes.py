@@ -6,7 +6,7 @@ Diffuse and rough reflectance and emission are not read here: Cycles evaluates t
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import bpy
 import numpy as np
@@ -17,6 +17,7 @@ from . import nodes
 OUTPUT = "ShaderNodeOutputMaterial"
 #: Below this roughness a reflection counts as a mirror's; above as diffuse with the same reflectance.
 MIRROR_ROUGHNESS = 0.1
+ROUGH_GLASS = "the glass {} is rough; light passes it as if it were clear"
 #: Shaders without any lobe that a ray could follow.
 ROUGH_SHADERS = {
     "ShaderNodeBsdfDiffuse", "ShaderNodeEmission", "ShaderNodeBsdfTranslucent", "ShaderNodeSubsurfaceScattering",
@@ -44,7 +45,15 @@ def read_lobes(material: bpy.types.Material) -> Lobes:
     """Of the surface that Cycles renders."""
     if not nodes.uses_nodes(material):
         return Lobes()
-    return _lobes(nodes.output_link(material.node_tree, OUTPUT, "Surface"))
+    tree = material.node_tree
+    lobes = _lobes(nodes.output_link(tree, OUTPUT, "Surface"))
+    notes = lobes.notes
+    if nodes.output_link(tree, OUTPUT, "Volume") is not None:
+        notes += ("its volume is not baked; only its surface scatters light",)
+    moved = getattr(material, "displacement_method", "BUMP") != "BUMP"
+    if moved and nodes.output_link(tree, OUTPUT, "Displacement") is not None:
+        notes += ("its displacement does not move the baked surface; use a Displace modifier instead",)
+    return replace(lobes, notes=notes)
 
 
 def _lobes(node: bpy.types.Node | None) -> Lobes:
@@ -105,22 +114,24 @@ def _principled(node: bpy.types.Node) -> Lobes:
     metallic, glass = metallic or 0.0, glass or 0.0
     smooth, base = _is_smooth(node), nodes.constant_input(node, "Base Color")
     specular, transmission = np.zeros(3), np.zeros(3)
-    if base is not None and smooth:
+    if base is not None:
         colour = np.maximum(np.array(base[:3], np.float64), 0)
-        specular = colour * metallic * opaque
+        specular = colour * (metallic * opaque if smooth else 0.0)
         # Cycles tints light that passes by the root of the colour at each face, in and out.
         transmission = np.sqrt(colour) * glass * (1 - metallic) * opaque
+        if glass > 0 and not smooth:
+            notes += (ROUGH_GLASS.format(node.name),)
     elif glass > 0 or (metallic > 0 and smooth):
-        why = "colour varies" if smooth else "roughness is high or varies"
-        notes += (f"the {why} in {node.name}, so its mirror or glass counts as diffuse",)
+        notes += (f"the colour of {node.name} varies, so its mirror or glass counts as rough and opaque",)
     return Lobes(specular, transmission, np.full(3, 1 - opaque), _ior(node), notes)
 
 
 def _glass(node: bpy.types.Node) -> Lobes:
     colour = nodes.constant_input(node, "Color")
-    if colour is None or not _is_smooth(node):
-        return Lobes(notes=(f"the glass {node.name} is rough or its colour varies; it is taken as opaque",))
-    return Lobes(transmission=np.array(colour[:3], np.float64), ior=_ior(node))
+    if colour is None:
+        return Lobes(notes=(f"the colour of the glass {node.name} varies; it is taken as opaque",))
+    notes = () if _is_smooth(node) else (ROUGH_GLASS.format(node.name),)
+    return Lobes(transmission=np.array(colour[:3], np.float64), ior=_ior(node), notes=notes)
 
 
 def _glossy(node: bpy.types.Node) -> Lobes:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import bpy
 import numpy as np
+from numpy.typing import NDArray
 
 from ..backend.scene import Bool, Float32, Int32
 
@@ -54,9 +55,14 @@ def topology_digest(mesh: bpy.types.Mesh) -> bytes:
     mesh.attributes[".corner_vert"].data.foreach_get("value", corners)
     starts = np.zeros(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("loop_start", starts)
+    return digest_of(np.array([len(mesh.vertices)]), corners, starts)
+
+
+def digest_of(*arrays: NDArray[np.generic]) -> bytes:
+    """16 bytes that differ where the contiguous ``arrays`` do."""
     digest = hashlib.blake2b(digest_size=16)
-    for part in (np.array([len(mesh.vertices)]), corners, starts):
-        digest.update(part)
+    for array in arrays:
+        digest.update(array)
     return digest.digest()
 
 

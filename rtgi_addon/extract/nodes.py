@@ -28,8 +28,6 @@ PLAIN_NODES = {
     "ShaderNodeRGBToBW", "ShaderNodeFresnel", "ShaderNodeLayerWeight", "ShaderNodeLightPath", "ShaderNodeBump",
     "ShaderNodeNormalMap",
 }  # fmt: skip
-#: Nodes that see which object they are on.
-OBJECT_NODES = {"ShaderNodeObjectInfo", "ShaderNodeTexCoord", "ShaderNodeNewGeometry", "ShaderNodeAttribute"}
 
 
 def uses_nodes(block: bpy.types.ID) -> bool:

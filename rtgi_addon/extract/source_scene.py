@@ -18,7 +18,7 @@ from ..backend.scene import Bool, Instance, Light, World
 from ..source import SourceMesh, SourceScene
 from . import lights, world
 from .as_rendered import read_as_rendered
-from .meshes import MeshArrays, positions, read_mesh, topology_digest, without_vertices
+from .meshes import MeshArrays, digest_of, positions, read_mesh, topology_digest, without_vertices
 from .placed import Key, Placed, placed_meshes
 from .stepping import frame_kept
 
@@ -102,7 +102,7 @@ def _visit(depsgraph: bpy.types.Depsgraph, frame: int, census: Census) -> None:
 
 def _examine(placed: Placed, at: tuple[int, MeshUse], census: Census) -> None:
     vertices = positions(placed.data)
-    census.digest[at] = (topology_digest(placed.data), vertices.tobytes())
+    census.digest[at] = (topology_digest(placed.data), digest_of(vertices))
     finite = np.isfinite(vertices).all(axis=1)
     if not finite.all():
         census.bad[at] = ~finite

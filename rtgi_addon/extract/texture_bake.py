@@ -28,7 +28,6 @@ class Evaluated:
 
     diffuse: Float32
     glossy: Float32
-    transmission: Float32
     emission: Float32  # radiance, W/(m² sr)
 
 
@@ -44,7 +43,7 @@ def bake_over_uv(
     margin: int = MARGIN,
 ) -> Evaluated:
     """``mesh`` has the UV layer RTGI and ``material_index`` into ``materials``. It is removed."""
-    kinds = ("DIFFUSE", "GLOSSY", "TRANSMISSION", "EMIT")
+    kinds = ("DIFFUSE", "GLOSSY", "EMIT")
     with temporary() as blocks:
         blocks.append(mesh)
         image = _target(size_px, blocks)

@@ -57,6 +57,8 @@ def evaluate_world(world: bpy.types.World | None, warn: Warn) -> World | None:
         )
     tree = list(nodes.reachable(world.node_tree, OUTPUT))
     width = WIDTH_IMAGE if any(isinstance(getattr(n, "image", None), bpy.types.Image) for n in tree) else WIDTH_PLAIN
+    if any(n.bl_idname == "ShaderNodeLightPath" and n.id_data != world.node_tree for n in tree):
+        warn(f"world {world.name}: a Light Path node inside a group answers as to the camera; move it out of the group")
     return World(_draw(world, width))
 
 

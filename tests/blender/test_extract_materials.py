@@ -171,6 +171,17 @@ def test_mirrors_and_glass(add_plane: AddObject) -> None:
     assert m["Veil"].opacity == pytest.approx(0.4)
 
 
+def test_rough_glass_passes_light_and_is_told(add_plane: AddObject) -> None:
+    add_plane("A", material=new_material("Frost", Base_Color=(0.25, 1, 1, 1), Transmission_Weight=1.0, Roughness=0.5))
+    add_plane("B", material=new_material("Milk", "ShaderNodeBsdfGlass", Color=RGBA, Roughness=0.5))
+    _, appearance = evaluate()
+    m = {x.name: x for x in appearance.materials}
+    assert m["Frost"].transmission == pytest.approx((0.5, 1, 1))
+    assert m["Milk"].transmission == pytest.approx((0.8, 0.4, 0.2), abs=1e-5)
+    assert sorted(w.split(":")[0] for w in appearance.warnings) == ["material Frost", "material Milk"]
+    assert all("is rough; light passes it as if it were clear" in w for w in appearance.warnings)
+
+
 def test_mixed_shaders(add_plane: AddObject) -> None:
     material = new_material("Mix", "ShaderNodeMixShader", Fac=0.25)
     mix = surface(material)
@@ -434,6 +445,38 @@ def test_varying_shares_are_told(add_plane: AddObject) -> None:
     _, appearance = evaluate()
     assert only(appearance).opacity == 1
     assert any(w.startswith("material Leaf: the alpha of") for w in appearance.warnings)
+
+
+def test_volumes_and_displacement_are_told(add_plane: AddObject) -> None:
+    material = new_material("Deep", "ShaderNodeBsdfDiffuse")
+    output = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeOutputMaterial")
+    tree = material.node_tree
+    tree.links.new(add_node(material, "ShaderNodeVolumeScatter").outputs[0], output.inputs["Volume"])
+    tree.links.new(add_node(material, "ShaderNodeDisplacement").outputs[0], output.inputs["Displacement"])
+    material.displacement_method = "BUMP"
+    add_plane(material=material)
+    assert [w.split(";")[0] for w in evaluate()[1].warnings] == ["material Deep: its volume is not baked"]
+    material.displacement_method = "DISPLACEMENT"
+    assert [w.split(";")[0] for w in evaluate()[1].warnings] == [
+        "material Deep: its volume is not baked",
+        "material Deep: its displacement does not move the baked surface",
+    ]
+
+
+def test_an_animated_texture_is_told(add_plane: AddObject) -> None:
+    material = new_material("Film", "ShaderNodeEmission")
+    link(material, add_image(material, checker()), "Color", "Color")
+    strength = surface(material).inputs["Strength"]
+    for frame, value in ((1, 1.0), (5, 9.0)):
+        strength.default_value = value
+        strength.keyframe_insert("default_value", frame=frame)
+    add_uv(add_plane("Screen", material=material))
+    bpy.context.scene.frame_set(1)
+    _, appearance = evaluate()
+    assert np.allclose(quadrants(appearance.emission_maps[0]), CHECKER, atol=1e-2)
+    assert appearance.warnings == (
+        "material Film: is animated and Screen is textured; it keeps its look of the first frame",
+    )
 
 
 def test_a_missing_image_file_names_material_and_file(add_plane: AddObject, tmp_path: Path) -> None:
