@@ -278,8 +278,7 @@ def _show(texture: bpy.types.ShaderNodeTexImage, maps: MapFiles, kind: str, page
     image.colorspace_settings.name = "Non-Color"
     image.alpha_mode = "CHANNEL_PACKED"
     image.use_half_precision = False  # half floats end at 65504 (Blender 4 clamps there all the same)
-    if bpy.data.filepath and Path(path).anchor == Path(bpy.data.filepath).anchor:
-        image.filepath = bpy.path.relpath(path)
+    image.filepath = stored_path(path)
     texture.image = image
     if len(maps.frames) == 1:
         return
@@ -294,6 +293,15 @@ def _show(texture: bpy.types.ShaderNodeTexImage, maps: MapFiles, kind: str, page
     if step > 1:
         held = f"{held} - fmod({held} - {first}, {step})"
     user.driver_add("frame_offset").driver.expression = f"{held} - max(frame, 0)"
+
+
+def stored_path(path: str | Path) -> str:
+    """``path`` as a .blend keeps it: relative to the file, where it has one on the same drive.
+
+    Saving the file elsewhere makes Blender mend it, so that scene and maps can be moved together.
+    """
+    own = bpy.data.filepath
+    return bpy.path.relpath(str(path)) if own and Path(path).anchor == Path(own).anchor else str(path)
 
 
 def _emit(wiring: _Wiring, irradiance: bpy.types.NodeSocket) -> None:

@@ -14,6 +14,7 @@ import bpy
 import numpy as np
 
 from .backend.scene import Float32
+from .lightmap_nodes import stored_path
 from .output import whole_file
 
 _HEADER = struct.Struct("<12siiffi")  # signature, version, points, first frame, frames per sample, samples
@@ -31,7 +32,7 @@ def play_pc2(obj: bpy.types.Object, path: Path, frames: Sequence[int]) -> None:
     """Let ``obj`` show sample i of ``path`` at ``frames[i]``; evenly spaced frames, the ends hold."""
     modifier = obj.modifiers.new("RTGI frames", "MESH_CACHE")
     modifier.cache_format = "PC2"
-    modifier.filepath = str(path)
+    modifier.filepath = stored_path(path)
     modifier.interpolation = "LINEAR"
     modifier.time_mode, modifier.play_mode = "FRAME", "SCENE"
     modifier.forward_axis, modifier.up_axis = "POS_Y", "POS_Z"
