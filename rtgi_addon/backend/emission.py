@@ -52,7 +52,7 @@ class PhotonSource(Protocol):
 
 @dataclass(frozen=True)
 class LampSource:
-    """A lamp as photon source."""
+    """A lamp as photon source. ``casts_shadow`` is for shadow rays alone: a photon lands on what it meets."""
 
     light: int
     lamp: Light
