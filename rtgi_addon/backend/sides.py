@@ -17,18 +17,28 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
+from .emission import make_bounds
 from .geometry import Geometry
 from .lamp_view import may_see, view_lamp
-from .lights import is_dark
+from .lights import emit_lamp, is_dark
 from .parallel import Workers
-from .sampling import UInt32, dot, hash_keys, sample_cosine_about, stratified_pair, unit_float32, unit_float64
+from .sampling import (
+    UInt32,
+    dot,
+    hash_keys,
+    photon_numbers,
+    sample_cosine_about,
+    stratified_pair,
+    unit_float32,
+    unit_float64,
+)
 from .scene import Bool, Float32, Float64, FrameState, Int32, Light, Scene
 from .sky import make_sky
 from .tracing import EmbreeTracer, Hits, Tracer
 
 #: Rays of all sides together, and of one side at least and at most (powers of two).
 TOTAL_RAYS = 1 << 18
-RAYS_OF_SIDE = (128, 256)
+RAYS_OF_SIDE = (128, 1024)
 #: Rays over all states together, about, and the states that are looked at whatever it costs.
 MOST_RAYS = 1 << 22
 LEAST_STATES = 16
@@ -38,8 +48,12 @@ PATH_SEGMENTS = 8
 LAMPS_OF_POINT = 4
 #: Panes that a ray towards a lamp passes.
 PANES = 4
-#: Times that paths are sent from a side about which there is doubt, if TOTAL_RAYS allows.
-SEARCHES = 4
+#: Photons of all lamps together and of one at least.
+PHOTONS, LEAST_PHOTONS = 1 << 14, 1 << 10
+#: Times that paths are sent from a side about which there is doubt, if TOTAL_RAYS allows, and of its points the share
+#: (one in so many) that send them: a find ends the search, so small steps are quicker.
+SEARCHES = 16
+SEARCH_STRIDE = 4
 #: Points keep this share of their triangle's corners away from its edges, out of cracks between triangles.
 INSET = 0.02
 
@@ -68,7 +82,8 @@ def lit_sides(scene: Scene, states: Sequence[FrameState], *, workers: Workers | 
     finally:
         if workers is None:
             own_workers.close()
-    return lit[0::2], lit[1::2]
+    receives = np.array([i.receives_light for i in scene.instances], np.bool_)
+    return lit[0::2] & receives, lit[1::2] & receives
 
 
 def _tested_states(states: int, sides: int) -> list[int]:
@@ -136,16 +151,35 @@ def _lit_in(setting: _Setting, known: Bool) -> Bool:
     lit = known.copy()
     emitting = setting.geometry.instance_of_triangle[setting.emits]
     lit[2 * emitting] = lit[2 * emitting + 1] = True
+    lit[_sides_hit_by_lamps(setting)] = True
     start = _first_rays(setting)
     start = start[~lit[start.side]]
     hits = setting.tracer.intersect(start.origin, start.direction)
     lit[start.side[_finds_light(setting, start, hits)]] = True
     doubtful = _grouped_with(setting, start, hits, lit) & ~lit
-    count = int(doubtful[start.side].sum())
+    count = int(doubtful[start.side].sum()) // SEARCH_STRIDE
     for search in range(min(SEARCHES, -(-TOTAL_RAYS // max(count, 1))) if count else 0):
-        rays = start[(doubtful & ~lit)[start.side]]
+        turn = np.arange(len(start.side)) % SEARCH_STRIDE == search % SEARCH_STRIDE
+        rays = start[(doubtful & ~lit)[start.side] & turn]
         _search_paths(setting, rays, search, lit)
     return lit
+
+
+def _sides_hit_by_lamps(setting: _Setting) -> NDArray[np.intp]:
+    """Sides that photons of the lamps land on first: finds what lies in a beam through a small window."""
+    geometry = setting.geometry
+    bounds = make_bounds(geometry)
+    found = []
+    if not bounds.is_empty:
+        index = np.arange(max(PHOTONS // max(len(setting.lamps), 1), LEAST_PHOTONS), dtype=np.uint32)
+        for number, lamp in enumerate(setting.lamps):
+            numbers = [unit_float64(n) for n in photon_numbers(np.full(len(index), number, np.int32), index, 0)]
+            photons = emit_lamp(lamp, numbers, origin=geometry.origin, bounds=bounds)
+            origin, direction = photons.origin.astype(np.float32), photons.direction.astype(np.float32)
+            hits = setting.tracer.intersect(origin, direction)
+            rows = np.nonzero(hits.triangle >= 0)[0]
+            found.append(2 * geometry.instance_of_triangle[hits.triangle[rows]] + hits.back[rows])
+    return np.unique(np.concatenate(found)) if found else np.zeros(0, np.intp)
 
 
 def _first_rays(setting: _Setting) -> _Rays:
@@ -161,7 +195,8 @@ def _first_rays(setting: _Setting) -> _Rays:
     # A triangle of the instance by area: the one in whose stretch of the running sum the number falls.
     at = low[tested, None] + (high - low)[tested, None] * pick
     triangle = np.searchsorted(total[1:], at.ravel(), side="right").clip(max=max(len(area) - 1, 0))
-    inside = _numbers(tested, count, 1)[0].ravel()
+    # What is left of that number within the stretch is uniform again: the points stay stratified over the area.
+    inside = ((at.ravel() - total[triangle]) / np.where(area[triangle] > 0, area[triangle], 1)).clip(0, 1)
     root = np.sqrt(weight.ravel())
     weights = np.stack([1 - root, root * (1 - inside), root * inside], axis=1) * (1 - 3 * INSET) + INSET
     position = np.einsum("rc,rci->ri", weights, geometry.corners[triangle].astype(np.float64)).astype(np.float32)
