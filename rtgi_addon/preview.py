@@ -116,7 +116,7 @@ def _direct_light_only(scene: bpy.types.Scene) -> Iterator[None]:
     probes = [o for o in scene.objects if o.type == "LIGHT_PROBE" and o.data.type == "VOLUME"]
     with ExitStack() as stack:
         # The threshold cuts far lamps off; no screen-space or fast global illumination.
-        stack.enter_context(_kept(scene.eevee, use_raytracing=False, light_threshold=0.0))
+        stack.enter_context(_kept(scene.eevee, use_raytracing=False, light_threshold=1e-4))
         for probe in probes:  # baked irradiance
             stack.enter_context(_kept(probe, hide_render=True))
         if scene.world is not None:
