@@ -25,8 +25,7 @@ from .extract.source_scene import frame_kept
 from .frames import FrameStates, bake_frames, failing, open_folder
 from .job import BakeJob, Plan
 from .layouts import assemble, expected_densities, lay_out, map_sizes
-from .lightmaps import remove_lightmaps
-from .lit_copy import is_lit, save_lit_copy
+from .lit_copy import save_lit_copy, take_off
 from .output import folder_problems, map_bytes
 from .scene_file import default_folder, default_frames, open_blend, scene_problems, scene_warnings
 from .terminal import Listener
@@ -59,7 +58,7 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
     report, setup, start = listener.report, FrameStats(), time.perf_counter()
     with setup.stage("open"):
         open_blend(job.scene)
-        _unlight(job)
+        take_off(job.scene)
         frames, out = _checked(job)
         report("open", 1, 1)
     with frame_kept(bpy.context.scene):
@@ -94,15 +93,6 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
                 report("save", 1, 1)
             folder.close("done")
     return _summary(plan, records, time.perf_counter() - start)
-
-
-def _unlight(job: BakeJob) -> None:
-    """Bake the scene itself, not the light maps that an earlier bake put on it; touch none but a file of its own."""
-    if not is_lit():
-        return
-    if job.scene is None:
-        raise BakeError("the open scene shows light maps; take them off with remove_lightmaps() and bake it then")
-    remove_lightmaps()
 
 
 def _checked(job: BakeJob) -> tuple[Sequence[int], Path]:

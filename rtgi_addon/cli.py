@@ -16,6 +16,7 @@ import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 from types import FrameType
 from typing import Any
 
@@ -63,7 +64,7 @@ def _conclude(work: Callable[[], Summary], listener: Listener) -> int:
         listener.finish("failed", {"problems": list(fault.problems)}, [f"error: {p}" for p in fault.problems])
         return FAILED
     except Cancelled:
-        listener.finish("cancelled", {}, ["cancelled; finished frames are kept, --resume goes on from them"])
+        listener.finish("cancelled", {}, ["cancelled; finished frames are kept (rtgi bake --resume goes on from them)"])
         return CANCELLED
     except Exception as fault:
         problem = f"{type(fault).__name__}: {fault}"
@@ -126,11 +127,32 @@ def _bake(arguments: argparse.Namespace, listener: Listener) -> Summary:
         save_blend=path_of(arguments.save_blend),
     )
     summary = bake(job, listener)
-    return {**asdict(summary), "out": str(summary.out)}, summary.in_words()
+    return _plain(asdict(summary)), summary.in_words()
 
 
 def _render(arguments: argparse.Namespace, listener: Listener) -> Summary:
-    raise NotImplementedError
+    problems: list[str] = []
+    frames, size = None, None
+    with _collecting(problems):
+        frames = frames_of(arguments.frames)
+    with _collecting(problems):
+        size = size_of(arguments.resolution)
+    maps = path_of(arguments.maps)
+    if problems or maps is None:
+        raise BakeError(*problems)
+    _need_bpy()
+    from .scene_file import named_or_open
+    from .show import ShowJob, show
+
+    scene = named_or_open(path_of(arguments.scene))
+    summary = show(ShowJob(maps, scene, frames, path_of(arguments.out), size, arguments.samples), listener)
+    return _plain(asdict(summary)), summary.in_words()
+
+
+def _plain(fields: dict[str, Any]) -> dict[str, Any]:
+    """``fields`` with paths as text."""
+    pictures = {"pictures": [str(path) for path in fields["pictures"]]} if "pictures" in fields else {}
+    return {**{k: str(v) if isinstance(v, Path) else v for k, v in fields.items()}, **pictures}
 
 
 def _need_bpy() -> None:

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A copy of the open scene that shows its light maps, saved as a .blend; the open scene stays as it is.
+"""A copy of the open scene that shows its light maps, saved as a .blend; and what to do when such a copy is baked.
 
-After the frames of a bake, for artists who go on working with the lit scene.
+Saved after the frames of a bake, for artists who go on working with the lit scene. The open scene stays unlit.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from pathlib import Path
 
 import bpy
 
+from .backend.errors import BakeError
 from .job import Plan
 from .lightmap_nodes import MARK
 from .lightmaps import apply_lightmaps, map_files, remove_lightmaps
@@ -18,9 +19,16 @@ from .output import whole_file
 from .source import Layout, SourceScene
 
 
-def is_lit() -> bool:
-    """Does the open scene show light maps already? They would be baked as if its surfaces shone."""
-    return any(group.get(MARK) for group in bpy.data.node_groups)
+def take_off(named: Path | None) -> None:
+    """Take light maps of an earlier bake off the open scene: they would be baked as if its surfaces shone.
+
+    Only off a file that was ``named`` to be opened. A scene that merely is open stays as it is, so that is refused.
+    """
+    if not any(group.get(MARK) for group in bpy.data.node_groups):
+        return
+    if named is None:
+        raise BakeError("the open scene shows light maps; take them off with remove_lightmaps() first")
+    remove_lightmaps()
 
 
 def save_lit_copy(path: Path, source: SourceScene, layouts: Sequence[Layout], plan: Plan) -> tuple[str, ...]:
