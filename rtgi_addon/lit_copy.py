@@ -36,8 +36,12 @@ def save_lit_copy(path: Path, source: SourceScene, layouts: Sequence[Layout], pl
     maps = map_files(plan.out, page_count=plan.atlas.page_count, frames=plan.frames)
     applied = apply_lightmaps(source, layouts, plan.atlas, maps, plan.states)
     try:
+        path.parent.mkdir(parents=True, exist_ok=True)
         with whole_file(path) as part:
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, check_existing=False)
+    except RuntimeError as fault:
+        reason = str(fault).strip().splitlines()[0].removeprefix("Error: ")
+        raise BakeError(f"{path}: cannot be written ({reason}); check free space and permissions") from fault
     finally:
         remove_lightmaps()
     return applied.warnings
