@@ -96,6 +96,7 @@ class Session:
         self._tracer = EmbreeTracer(scene, self.geometry, state, self._workers)
         self.texels = make_texels(scene, atlas, self.geometry)
         self._bounds = emission.make_bounds(self.geometry)
+        self._sides = sending_sides(scene, atlas)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn_paths)
 
     def close(self) -> None:
@@ -175,6 +176,7 @@ class Session:
     def _place(self, state: FrameState) -> _Placed:
         changed = self.geometry.update(state)
         self._tracer.update(state, changed)
+        self._bounds = emission.grown_bounds(self._bounds, self.geometry)
         frame = place_texels(self.texels, self.geometry)
         materials = state.materials or self.scene.materials
         albedo, glow = texel_colours(self.texels, self.scene, self.geometry, materials)
@@ -236,13 +238,13 @@ class Session:
         if self.settings.aim_bounced is not AimBounced.PHOTONS:
             return radiosity.solve(links, outside, placed.albedo, placed.emitted)
         paths = self._photons(placed, stats)
-        # Sky and emissive meshes land in the AIM with their first hit; lamps' first hits are in `outside`.
-        hits = photon_map.bounced_hits(paths) | (photon_map.direct_hits(paths) & ~photon_map.lamp_hits(paths))
+        # Lamps' light is in `outside` until it has bounced diffusely; all of sky's and emissive meshes' is here.
+        hits = photon_map.bounced_hits(paths) | ~photon_map.lamp_hits(paths)
         aim = outside + self._density(paths, hits, placed)
         return Illumination(aim, radiosity.gather(links, aim, placed.albedo, placed.emitted), 1, 0.0)
 
     def _photons(self, placed: _Placed, stats: FrameStats) -> photons.PhotonPaths:
-        sources = emission.make_sources(self.scene, placed.state, self.geometry, self._bounds)
+        sources = emission.make_sources(self.scene, placed.state, self.geometry, self._bounds, sides=self._sides)
         counts = emission.photon_counts(sources, self.settings.photons)
         light, index = emission.all_photons(counts)
         paths, book = photons.trace_photons(
@@ -267,6 +269,13 @@ class Session:
             caustics=None if caustic is None else end.to_pages(end.fill(caustic, lit.valid)),
             valid=end.valid_pages(lit.valid),
         )
+
+
+def sending_sides(scene: Scene, atlas: Atlas) -> Bool:
+    """(instances, 2) which sides send light: those with a map, and both of an object that has no map by choice."""
+    mapped = [[p is not None for p in pair] for pair in zip(atlas.front, atlas.back, strict=True)]
+    unmapped = np.array([not i.receives_light for i in scene.instances], np.bool_)
+    return np.array(mapped, np.bool_).reshape(-1, 2) | unmapped[:, None]
 
 
 def noise_estimate(full: Float32, half: Float32) -> float | None:
