@@ -11,24 +11,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
-from pathlib import Path
 
 import bpy
 
-from .output import map_name
+from .lightmap_sampling import MARK, MapFiles, fill_group
 
 GROUP_NAME = "RTGI Light"
-UV_LAYER = "RTGI"
-MARK = "rtgi"
 FRAMES = "rtgi_frames"  # on the group: first and last frame of its maps
-
-#: Object properties the group reads, (front, back); each is three floats: ``*_scale`` holds scale u, scale v and
-#: page + 1 (0: no map on this side, which is also what an object without the property gives), ``*_offset`` u, v, 0.
-SCALE_PROPERTIES = ("rtgi_front_scale", "rtgi_back_scale")
-OFFSET_PROPERTIES = ("rtgi_front_offset", "rtgi_back_offset")
-
-_LAST_FRAME = 1_048_574  # Blender's MAXFRAME
 
 #: Diffuse closures: which of the closure's inputs feed which of the group's.
 _GROUP_INPUTS_OF_CLOSURE = {
@@ -47,19 +36,6 @@ _GROUP_INPUTS_OF_CLOSURE = {
 _UNREAD_CLOSURES = ("ShaderNodeBsdfTranslucent", "ShaderNodeBsdfSheen", "ShaderNodeBsdfHairPrincipled")
 
 
-@dataclass(frozen=True)
-class MapFiles:
-    """The light maps of a bake on disk: ``folder/<kind>.p<page>.<frame>.exr``."""
-
-    folder: Path
-    kinds: tuple[str, ...]  # "iim", "caustics"
-    page_count: int
-    frames: tuple[int, ...]  # ascending, evenly spaced
-
-    def path(self, kind: str, page: int, frame: int) -> Path:
-        return self.folder / map_name(kind, page, frame)
-
-
 def make_group(maps: MapFiles) -> bpy.types.ShaderNodeTree:
     """The node group over ``maps``, in place of an older one of ours."""
     remove_group()
@@ -71,10 +47,7 @@ def make_group(maps: MapFiles) -> bpy.types.ShaderNodeTree:
     for name, default in (("Metallic", 0.0), ("Transmission", 0.0), ("Alpha", 1.0)):
         socket = tree.interface.new_socket(name, in_out="INPUT", socket_type="NodeSocketFloat")
         socket.default_value, socket.min_value, socket.max_value = default, 0.0, 1.0
-    wiring = _Wiring(tree)
-    uv, page = _place_in_atlas(wiring)
-    irradiance = _sample_pages(wiring, maps, uv, page)
-    _emit(wiring, irradiance)
+    fill_group(tree, maps)
     return tree
 
 
@@ -197,118 +170,3 @@ def animation_curves(animation: bpy.types.AnimData) -> list[bpy.types.FCurve]:
     slot = animation.action_slot
     bags = [strip.channelbag(slot) for layer in action.layers for strip in layer.strips] if slot else []
     return [curve for bag in bags if bag is not None for curve in bag.fcurves]
-
-
-class _Wiring:
-    """Nodes added to one tree, left to right, by what they compute; inputs are sockets or constants."""
-
-    def __init__(self, tree: bpy.types.ShaderNodeTree) -> None:
-        self.tree = tree
-        self._column = 0
-
-    def node(self, kind: str, *inputs: object, **attributes: object) -> bpy.types.Node:
-        node = self.tree.nodes.new(kind)
-        node.location = (180.0 * (self._column // 4), -170.0 * (self._column % 4))
-        self._column += 1
-        for name, value in attributes.items():
-            setattr(node, name, value)
-        for socket, value in zip(node.inputs, inputs, strict=False):
-            if isinstance(value, bpy.types.NodeSocket):
-                self.tree.links.new(value, socket)
-            elif value is not None:
-                socket.default_value = value
-        return node
-
-    def math(self, operation: str, *inputs: object, clamp: bool = False) -> bpy.types.NodeSocket:
-        return self.node("ShaderNodeMath", *inputs, operation=operation, use_clamp=clamp).outputs[0]
-
-    def vector(self, operation: str, *inputs: object) -> bpy.types.NodeSocket:
-        return self.node("ShaderNodeVectorMath", *inputs, operation=operation).outputs[0]
-
-    def scaled(self, vector: bpy.types.NodeSocket, factor: bpy.types.NodeSocket) -> bpy.types.NodeSocket:
-        node = self.node("ShaderNodeVectorMath", vector, operation="SCALE")
-        self.tree.links.new(factor, node.inputs["Scale"])
-        return node.outputs[0]
-
-
-def _place_in_atlas(wiring: _Wiring) -> tuple[bpy.types.NodeSocket, bpy.types.NodeSocket]:
-    """Page UV and page + 1 of the shaded point, on the side that faces the viewer.
-
-    Blender's "backfacing" follows the object's own front, mirrored or not, as ``Atlas`` does.
-    """
-    back = wiring.node("ShaderNodeNewGeometry").outputs["Backfacing"]
-    sides = []
-    for names in (SCALE_PROPERTIES, OFFSET_PROPERTIES):
-        front, behind = (
-            wiring.node("ShaderNodeAttribute", attribute_type="OBJECT", attribute_name=name).outputs["Vector"]
-            for name in names
-        )
-        difference = wiring.vector("SUBTRACT", behind, front)
-        sides.append(wiring.vector("ADD", front, wiring.scaled(difference, back)))
-    scale, offset = sides
-    uv = wiring.node("ShaderNodeUVMap", uv_map=UV_LAYER).outputs["UV"]
-    page = wiring.node("ShaderNodeSeparateXYZ", scale).outputs["Z"]
-    return wiring.vector("MULTIPLY_ADD", uv, scale, offset), page
-
-
-def _sample_pages(
-    wiring: _Wiring, maps: MapFiles, uv: bpy.types.NodeSocket, page: bpy.types.NodeSocket
-) -> bpy.types.NodeSocket:
-    """Sum over kinds of the irradiance on the point's own page; black without a page."""
-    total = None
-    for index in range(maps.page_count):
-        light = None
-        for kind in maps.kinds:
-            texture = wiring.node("ShaderNodeTexImage", uv, extension="EXTEND", interpolation="Linear")
-            _show(texture, maps, kind, index)
-            color = texture.outputs["Color"]
-            light = color if light is None else wiring.vector("ADD", light, color)
-        masked = wiring.scaled(light, wiring.math("COMPARE", page, index + 1.0, 0.5))
-        total = masked if total is None else wiring.vector("ADD", total, masked)
-    return total
-
-
-def _show(texture: bpy.types.ShaderNodeTexImage, maps: MapFiles, kind: str, page: int) -> None:
-    """Let an image texture show one map, following the scene's frame; ends hold outside the baked range."""
-    first, last = maps.frames[0], maps.frames[-1]
-    path = str(maps.path(kind, page, first))
-    image = bpy.data.images.load(path, check_existing=False)
-    image[MARK] = True
-    image.name = f"rtgi_{kind}.p{page}"
-    image.colorspace_settings.name = "Non-Color"
-    image.alpha_mode = "CHANNEL_PACKED"
-    image.use_half_precision = False  # half floats end at 65504 (Blender 4 clamps there all the same)
-    image.filepath = stored_path(path)
-    texture.image = image
-    if len(maps.frames) == 1:
-        return
-    image.source = "SEQUENCE"
-    user = texture.image_user
-    user.use_auto_refresh, user.use_cyclic = True, False
-    # Blender shows file number (frame - frame_start + 1, clamped to 0 .. frame_duration) + frame_offset: the offset
-    # makes it the last baked frame at or before the scene's. The expression is too simple to need script rights.
-    user.frame_start, user.frame_duration = 1, _LAST_FRAME
-    step = maps.frames[1] - first
-    held = f"min(max(frame, {first}), {last})"
-    if step > 1:
-        held = f"{held} - fmod({held} - {first}, {step})"
-    user.driver_add("frame_offset").driver.expression = f"{held} - max(frame, 0)"
-
-
-def stored_path(path: str | Path) -> str:
-    """``path`` as a .blend keeps it: relative to the file, where it has one on the same drive.
-
-    Saving the file elsewhere makes Blender mend it, so that scene and maps can be moved together.
-    """
-    own = bpy.data.filepath
-    return bpy.path.relpath(str(path)) if own and Path(path).anchor == Path(own).anchor else str(path)
-
-
-def _emit(wiring: _Wiring, irradiance: bpy.types.NodeSocket) -> None:
-    inputs = wiring.node("NodeGroupInput").outputs
-    diffuse = wiring.math("SUBTRACT", 1.0, inputs["Metallic"], clamp=True)
-    opaque = wiring.math("SUBTRACT", 1.0, inputs["Transmission"], clamp=True)
-    share = wiring.math("MULTIPLY", wiring.math("MULTIPLY", diffuse, opaque), inputs["Alpha"], clamp=True)
-    radiosity = wiring.scaled(wiring.vector("MULTIPLY", irradiance, inputs["Albedo"]), share)
-    emission = wiring.node("ShaderNodeEmission", radiosity, 1.0 / math.pi)
-    wiring.node("NodeGroupOutput", emission.outputs[0])

@@ -12,7 +12,8 @@ from collections.abc import Iterable
 import bpy
 import numpy as np
 
-from .lightmap_nodes import MARK, light_tree, nested_trees, unlight_tree
+from .lightmap_nodes import light_tree, nested_trees, unlight_tree
+from .lightmap_sampling import MARK
 
 ORIGINAL = "rtgi_original"  # on a copy: the datablock it replaces; absent where there was none
 _DEFAULT_GREY = (0.8, 0.8, 0.8, 1.0)  # what Blender draws a face without a material in

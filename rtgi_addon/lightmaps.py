@@ -19,15 +19,8 @@ from .backend.errors import BakeError
 from .backend.scene import Atlas, FrameState, Placement
 from .extract.as_rendered import read_as_rendered
 from .extract.source_scene import frame_kept
-from .lightmap_nodes import (
-    MARK,
-    OFFSET_PROPERTIES,
-    SCALE_PROPERTIES,
-    UV_LAYER,
-    MapFiles,
-    make_group,
-    remove_group,
-)
+from .lightmap_nodes import make_group, remove_group
+from .lightmap_sampling import MARK, OFFSET_PROPERTIES, SCALE_PROPERTIES, UV_LAYER, MapFiles
 from .lightmap_slots import light_materials, unlight_materials
 from .point_cache import play_pc2, write_pc2
 from .source import Layout, SourceScene

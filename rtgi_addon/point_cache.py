@@ -14,7 +14,7 @@ import bpy
 import numpy as np
 
 from .backend.scene import Float32
-from .lightmap_nodes import stored_path
+from .lightmap_sampling import stored_path
 from .output import whole_file
 
 _HEADER = struct.Struct("<12siiffi")  # signature, version, points, first frame, frames per sample, samples

@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 from .backend.scene import Float32, Float64, FrameState, Int32
 from .extract.meshes import loop_normals, positions, topology_digest
 from .extract.placed import identify, placed_meshes
-from .lightmap_nodes import MARK, UV_LAYER, animation_curves
+from .lightmap_nodes import animation_curves
+from .lightmap_sampling import MARK, UV_LAYER
 from .source import SourceScene
 
 COLLECTION = "RTGI stand-ins"
