@@ -44,11 +44,7 @@ def main() -> None:
     in_texel = np.bincount(points.texel)
     log.info("%s: %d of %d texels, %d points", arguments.scene.stem, len(chosen), wanted, len(points.texel))
     part = TexelTable(
-        position=_means(points.texel, points.position, in_texel),
-        normal=_means(points.texel, points.normal, in_texel).astype(np.float32),
-        area=table.area[chosen],
-        object=table.object[chosen],
-        names=table.names,
+        table.position[chosen], table.normal[chosen], table.area[chosen], table.object[chosen], table.names
     )
     out = arguments.out or FOLDER / f"{arguments.scene.stem}.npz"
     whole = in_texel / GRID**2
