@@ -22,7 +22,7 @@ from .backend.sides import lit_sides
 from .backend.stats import FrameStats
 from .extract import evaluate_materials, extract_source
 from .extract.source_scene import frame_kept
-from .frames import FrameStates, bake_frames, failing, open_folder
+from .frames import FrameStates, bake_frames, failing, open_folder, telling_states
 from .job import BakeJob, Plan
 from .layouts import assemble, expected_densities, lay_out, map_sizes
 from .lit_copy import save_lit_copy, take_off
@@ -74,8 +74,7 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
             scene = assemble(source, layouts, appearance)
             states = FrameStates(source, frames, scene.materials)
         with setup.stage("sides"):
-            report("sides", 0, 1)
-            front, back = lit_sides(scene, states)
+            front, back = lit_sides(scene, telling_states(states, report))
         with setup.stage("pack"):
             wanted = {"front": front, "back": back}
             packing = pack(scene, resolution=job.settings.resolution, density=job.settings.density, **wanted)

@@ -19,6 +19,8 @@ from numpy.typing import NDArray
 
 from .backend.errors import BakeError, Cancelled
 from .backend.geometry import Geometry
+from .backend.lights import is_dark
+from .backend.progress import Report
 from .backend.scene import Atlas, FrameState, LightMaps, Material, Scene
 from .backend.session import Session
 from .backend.stats import FrameStats
@@ -30,6 +32,9 @@ from .job import Plan
 from .output import FORMAT, BakeFolder, FrameFailed, digest, folder_problems, map_bytes, map_name, write_arrays
 from .source import SourceScene
 from .terminal import Listener
+
+#: States of a moving scene that are searched for lit sides; a search takes about a third of a frame's bake.
+SIDES_TESTED = 8
 
 
 class FrameStates(Sequence[FrameState]):
@@ -49,6 +54,23 @@ class FrameStates(Sequence[FrameState]):
         frame = self._frames[index]
         bpy.context.scene.frame_set(frame)
         return frame_state(self._source, frame, constants=self._materials)
+
+
+def telling_states(states: Sequence[FrameState], report: Report) -> list[FrameState]:
+    """The states that decide which sides light can reach: SIDES_TESTED of them evenly spaced, and each in which objects
+    are shown, or lamps, sky or materials shine, that were not together before."""
+    count = len(states)
+    chosen = {round(i * (count - 1) / (SIDES_TESTED - 1)) for i in range(SIDES_TESTED)}
+    told, seen = [], set()
+    for index, state in enumerate(states):
+        report("sides", index, count)
+        glows = () if state.materials is None else tuple(max(m.emission) > 0 for m in state.materials)
+        lamps = tuple(is_dark(light) for light in state.lights)
+        kind = (state.visible.tobytes(), lamps, glows, state.world is None or state.world.is_black)
+        if index in chosen or kind not in seen:
+            told.append(state)
+        seen.add(kind)
+    return told
 
 
 def open_folder(plan: Plan) -> BakeFolder:

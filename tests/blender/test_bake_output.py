@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,10 +20,13 @@ import numpy as np
 import pytest
 
 from rtgi_addon.backend.errors import BakeError
+from rtgi_addon.backend.progress import silent
+from rtgi_addon.backend.scene import FrameState, Light, LightKind
 from rtgi_addon.backend.settings import BakeSettings, Quality
 from rtgi_addon.bake import bake
 from rtgi_addon.cli import run
 from rtgi_addon.exr import read_page
+from rtgi_addon.frames import SIDES_TESTED, telling_states
 from rtgi_addon.job import BakeJob
 from rtgi_addon.output import map_name
 
@@ -357,3 +361,16 @@ def test_a_lit_scene_that_is_merely_open_is_not_baked(scene_file: Path, tmp_path
     with pytest.raises(BakeError, match="remove_lightmaps"):
         bake(BakeJob(frames=[1], out=tmp_path / "out"))
     assert not (tmp_path / "out").exists()
+
+
+def test_sides_are_searched_in_each_frame_that_shows_or_lights_something_new() -> None:
+    lamp = Light("Lamp", LightKind.POINT, np.eye(4), (1.0, 1.0, 1.0))
+    off = replace(lamp, power=(0.0, 0.0, 0.0))
+    still = FrameState(0, np.eye(4)[None], np.ones(1, np.bool_), (off,), None)
+    states = [replace(still, frame=frame, lights=(lamp if frame == 33 else off,)) for frame in range(100)]
+    told = [state.frame for state in telling_states(states, silent)]
+    assert 33 in told  # lit for a single frame, between those evenly spaced
+    assert told[0] == 0
+    assert told[-1] == 99
+    assert len(told) == SIDES_TESTED + 1
+    assert [state.frame for state in telling_states(states[:1], silent)] == [0]
