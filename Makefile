@@ -3,7 +3,7 @@
 .DEFAULT_GOAL := help
 SHELL := /bin/sh
 PY := .venv/bin/python
-BAKE_FLAGS ?= --quality preview
+BAKE_FLAGS ?=
 PLATFORM ?=
 PYTEST_FLAGS ?=
 export PYTHONHASHSEED := 0
@@ -17,7 +17,8 @@ setup: ## make .venv with pinned versions: Blender 5.0 on Python 3.11, else 5.2 
 
 demo: setup ## bake every scene of demo_blend/ into out/demo/ (BAKE_FLAGS="...")
 	@set -e; for scene in demo_blend/*.blend; do name=$$(basename "$$scene" .blend); \
-	  echo "$$name" >&2; $(PY) -m rtgi_addon bake "$$scene" --out "out/demo/$$name" $(BAKE_FLAGS) </dev/null; done
+	  case $$name in interior) size=1024 ;; *) size=256 ;; esac; echo "$$name" >&2; \
+	  $(PY) -m rtgi_addon bake "$$scene" --out "out/demo/$$name" $(or $(BAKE_FLAGS),--resolution $$size) </dev/null; done
 
 scenes: ## build demo_blend/*.blend again, with the oldest Blender supported, so that all can open them
 	@sh tools/setup.sh .venv-4.2 4.2
