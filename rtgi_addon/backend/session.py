@@ -15,10 +15,12 @@ from types import TracebackType
 import numpy as np
 
 from . import caustics, emission, photon_map, photons, radiosity
+from .bright import bright_targets
 from .direct import direct_irradiance, make_shadows
 from .finish import Finisher
+from .gather import GatherRays
 from .geometry import Geometry
-from .links import Links, LinkTracer, bright_targets, trace_links
+from .links import Links, trace_links
 from .parallel import Workers
 from .progress import Report, silent
 from .radiosity import Illumination
@@ -224,7 +226,7 @@ class Session:
         known = placed.emitted.copy()
         known[: self.texels.count] += placed.albedo * outside
         bright = bright_targets(known, placed.frame.area, placed.sky, self.geometry.extent)
-        tracer = LinkTracer(
+        tracer = GatherRays(
             self.texels, placed.frame, self.geometry, placed.surfaces, self._tracer, placed.sky, bright, samples,
             max_specular=self.settings.max_specular, seed=self.settings.seed,
         )  # fmt: skip
