@@ -5,6 +5,11 @@ from __future__ import annotations
 
 import bpy
 
+#: Not content. Who brought a library's data in changes with any local user until the file is saved.
+_NOT_CONTENT = {"rna_type", "users", "is_evaluated", "session_uid", "warning_propagation", "is_library_indirect"}
+if bpy.app.version >= (5, 0):
+    _NOT_CONTENT.add("use_nodes")  # always true there, and asking is deprecated
+
 
 def dump_file() -> dict[str, object]:
     """All that the file holds of materials, node trees, slots, meshes and images, as comparable values."""
@@ -59,7 +64,7 @@ def dump(block: bpy.types.bpy_struct) -> dict[str, object]:
     """Every plain property of ``block``."""
     values = {}
     for prop in block.bl_rna.properties:
-        if prop.identifier in ("rna_type", "users", "is_evaluated", "session_uid", "warning_propagation", "use_nodes"):
+        if prop.identifier in _NOT_CONTENT:
             continue
         if prop.type in ("BOOLEAN", "INT", "FLOAT", "STRING", "ENUM"):
             value = getattr(block, prop.identifier)

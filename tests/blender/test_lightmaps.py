@@ -183,6 +183,53 @@ def test_every_kind_of_object_shows_its_own_rectangle(picture, add_mesh, tmp_pat
     assert not picture(width=192, height=192, span=16.0).any()  # no lamp: unlit again, and the originals are back
 
 
+def scatter_nodes(material: bpy.types.Material) -> bpy.types.NodeTree:
+    """Two grids, three metres apart along x, as instances of plain geometry."""
+    tree = bpy.data.node_groups.new("Scatter", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    line, grid = tree.nodes.new("GeometryNodeMeshLine"), tree.nodes.new("GeometryNodeMeshGrid")
+    line.inputs["Count"].default_value, line.inputs["Offset"].default_value = 2, (3.0, 0.0, 0.0)
+    for side in ("Size X", "Size Y"):
+        grid.inputs[side].default_value = 1.6
+    for count in ("Vertices X", "Vertices Y"):
+        grid.inputs[count].default_value = 2
+    paint, instances = tree.nodes.new("GeometryNodeSetMaterial"), tree.nodes.new("GeometryNodeInstanceOnPoints")
+    paint.inputs["Material"].default_value = material
+    end = tree.nodes.new("NodeGroupOutput")
+    tree.links.new(grid.outputs[0], paint.inputs["Geometry"])
+    tree.links.new(line.outputs[0], instances.inputs["Points"])
+    tree.links.new(paint.outputs[0], instances.inputs["Instance"])
+    tree.links.new(instances.outputs[0], end.inputs[0])
+    return tree
+
+
+def test_instances_by_geometry_nodes_and_objects_of_a_library(picture, add_mesh, tmp_path):
+    scene, material = bpy.context.scene, white()
+    add_mesh("Linked", SQUARE, [(0, 1, 2, 3)], material=material, location=(4, 4, 0))
+    bpy.data.libraries.write(str(tmp_path / "library.blend"), {bpy.data.objects["Linked"]})
+    bpy.data.objects.remove(bpy.data.objects["Linked"])
+    with bpy.data.libraries.load(str(tmp_path / "library.blend"), link=True) as (_, wanted):
+        wanted.objects = ["Linked"]
+    linked = wanted.objects[0]
+    scene.collection.objects.link(linked)
+    scatter = add_mesh("Scatter", [(0, 0, 0)], [], location=(-6, -4, 0))
+    scatter.modifiers.new("Nodes", "NODES").node_group = scatter_nodes(material)
+    bpy.context.view_layer.update()
+    before = dump_file()
+    source, applied = light(tmp_path)
+    drawn = picture(width=192, height=192, span=16.0)
+    values = sorted(drawn[*pixel_of(x + 0.2, -4), 0] for x in (-6, -3))
+    numbers = [i + 1 for i, instance in enumerate(source.instances) if instance.name.startswith("Scatter")]
+    assert len(numbers) == 2, [instance.name for instance in source.instances]
+    assert values == pytest.approx(numbers, abs=0.05)
+    expect(drawn, source, {source.instances[source.keys.index(("", linked.name_full, 0))].name: (4, 4)})
+    assert applied.standins == 3
+    remove_lightmaps()
+    after = dump_file()
+    for part in before:
+        assert after[part] == before[part], part
+
+
 def test_standins_follow_the_frames(picture, add_mesh, tmp_path):
     """A moving instance, a deforming generated mesh, one that is hidden for a while, and a frame in between."""
     scene, material = bpy.context.scene, white()
