@@ -14,11 +14,15 @@ import numpy as np
 import scipy.sparse
 
 from .dilate import DilationMap
+from .geometry import triangle_normals
 from .scene import Atlas, Bool, Float32, Float64, Int32, Mesh, Placement, Scene
 from .solvers import conjugate_gradients
 
 #: Shading normals further apart than this mark an edge the artist wants to see.
 SMOOTH_DEGREES = 5.0
+#: Faces further apart than this are not one surface, however they are shaded: light differs round such an edge, as on
+#: the rim of a smooth-shaded lampshade.
+BEND_DEGREES = 60.0
 #: UVs closer than this are the same point: a thousandth of a pixel on a page of 16k.
 SAME_UV = 1e-7
 SAMPLES_PER_PX = 2.0
@@ -40,10 +44,16 @@ class Seams:
 
 
 def find_seams(
-    triangles: Int32, corner_uv: Float32, corner_normals: Float32, *, smooth_degrees: float = SMOOTH_DEGREES
+    triangles: Int32,
+    corner_uv: Float32,
+    corner_normals: Float32,
+    *,
+    face_normals: Float32 | None = None,
+    smooth_degrees: float = SMOOTH_DEGREES,
 ) -> Seams:
     """Edges between two triangles (t, 3) with other UVs (t, 3, 2) but the same shading normals (t, 3, 3) at both ends.
 
+    With ``face_normals`` (t, 3) edges that bend by more than BEND_DEGREES are left out too; zero normals bend nothing.
     Edges of more than two triangles are left out: which of them belong together is not known.
     """
     corners = np.array([[0, 1], [1, 2], [2, 0]])
@@ -62,6 +72,10 @@ def find_seams(
     cut = np.abs(uv[a] - uv[b]).max(axis=(1, 2), initial=0) > SAME_UV
     mapped = (_lengths(uv[a]) > SAME_UV) & (_lengths(uv[b]) > SAME_UV)
     found = smooth & cut & mapped & (ends[a, 0] != ends[a, 1])
+    if face_normals is not None:
+        face_a, face_b = face_normals[a // 3], face_normals[b // 3]
+        straight = np.einsum("si,si->s", face_a, face_b) >= np.cos(np.radians(BEND_DEGREES))
+        found &= straight | ~face_a.any(axis=1) | ~face_b.any(axis=1)
     return Seams(uv[a[found]], uv[b[found]])
 
 
@@ -129,7 +143,8 @@ def _samples(scene: Scene, atlas: Atlas, dilation: DilationMap, surface: Int32) 
 
 
 def _seams_of(mesh: Mesh) -> Seams:
-    return find_seams(mesh.triangles, mesh.corner_uv, mesh.corner_normals)
+    faces = triangle_normals(mesh.vertices[mesh.triangles].astype(np.float64)).astype(np.float32)
+    return find_seams(mesh.triangles, mesh.corner_uv, mesh.corner_normals, face_normals=faces)
 
 
 def _along(seams: Seams, placement: Placement, resolution: int) -> tuple[Float64, Float64]:

@@ -209,3 +209,14 @@ def test_nothing_to_match_costs_nothing():
     values = lit(texels)
     assert matcher.texel_count == matcher.sample_count == 0 and matcher.match(values) is values
     assert matcher.jumps(values).shape == (0, 3)
+
+
+def test_a_smooth_shaded_rim_is_no_seam():
+    """Faces back to back that share their shading normals: light may differ on their two sides."""
+    triangles, uv, normals = two_triangles()
+    flat = np.array([[0, 0, 1], [0, 0, 1]], np.float32)
+    bent = np.array([[0, 0, 1], [np.sin(1.1), 0, np.cos(1.1)]], np.float32)
+    assert len(find_seams(triangles, uv, normals, face_normals=flat).uv_a) == 1
+    assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 0
+    bent[1] = np.sin(1.0), 0, np.cos(1.0)  # 57°: a coarse tube
+    assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 1
