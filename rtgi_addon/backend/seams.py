@@ -22,7 +22,7 @@ from .solvers import conjugate_gradients
 SMOOTH_DEGREES = 5.0
 #: Faces further apart than this are not one surface, however they are shaded: light differs round such an edge, as on
 #: the rim of a smooth-shaded lampshade.
-BEND_DEGREES = 60.0
+BEND_DEGREES = 30.0
 #: UVs closer than this are the same point: a thousandth of a pixel on a page of 16k.
 SAME_UV = 1e-7
 SAMPLES_PER_PX = 2.0

@@ -93,7 +93,7 @@ class BakeSettings:
     nearest_photons: int = _setting(64, "photons in one irradiance estimate (k)", 4, 1024)
     max_bounces: int = _setting(64, "longest photon path", 1, 1024)
     max_specular: int = _setting(16, "mirrors and glass one ray may pass", 0, 256)
-    denoise: bool = _setting(True, "Open Image Denoise's light-map filter on the IIM")
+    denoise: bool = _setting(True, "Open Image Denoise on the IIM")
     seams: bool = _setting(True, "match the borders of islands of one smooth surface")
     threads: int = _setting(0, "threads for tracing; 0: one per core", 0, 1024)
     seed: int = _setting(0, "another seed gives other noise, same expectation", 0, 2**31 - 1)

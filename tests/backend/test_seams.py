@@ -218,5 +218,5 @@ def test_a_smooth_shaded_rim_is_no_seam():
     bent = np.array([[0, 0, 1], [np.sin(1.1), 0, np.cos(1.1)]], np.float32)
     assert len(find_seams(triangles, uv, normals, face_normals=flat).uv_a) == 1
     assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 0
-    bent[1] = np.sin(1.0), 0, np.cos(1.0)  # 57°: a coarse tube
+    bent[1] = np.sin(0.5), 0, np.cos(0.5)  # 29°: a tube of thirteen sides
     assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 1
