@@ -10,9 +10,9 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from rtgi_addon.backend.geometry import Geometry
 from rtgi_addon.backend.scene import Float32, Float64, Placement
-from rtgi_addon.backend.texels import Texels
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.texels import Texels
 
 from .measure import Cost, Meter
 from .prepare import Prepared

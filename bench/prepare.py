@@ -9,13 +9,13 @@ from pathlib import Path
 import bpy
 import numpy as np
 
-from rtgi_addon.backend.geometry import Geometry
-from rtgi_addon.backend.packing import pack
+from rtgi_addon.backend.layout.packing import pack
+from rtgi_addon.backend.layout.sides import lit_sides
 from rtgi_addon.backend.progress import silent
 from rtgi_addon.backend.scene import Atlas, FrameState, Scene
 from rtgi_addon.backend.settings import BakeSettings
-from rtgi_addon.backend.sides import lit_sides
-from rtgi_addon.backend.texels import Texels, make_texels, place_texels
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.texels import Texels, make_texels, place_texels
 from rtgi_addon.extract import evaluate_materials, extract_source
 from rtgi_addon.frames import FrameStates
 from rtgi_addon.layouts import assemble, expected_densities, lay_out, map_sizes

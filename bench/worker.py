@@ -11,12 +11,12 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
-from rtgi_addon.backend.denoise import MapDenoiser
-from rtgi_addon.backend.oidn import Denoiser, find_oidn
+from rtgi_addon.backend.finish.denoise import MapDenoiser
+from rtgi_addon.backend.finish.oidn import Denoiser, find_oidn
 from rtgi_addon.backend.scene import Bool, Float32, Int32
 from rtgi_addon.backend.session import FrameResult, Session
 from rtgi_addon.backend.settings import BakeSettings, Quality
-from rtgi_addon.backend.texels import Texels
+from rtgi_addon.backend.surface.texels import Texels
 from rtgi_addon.environment import device, library_folders, versions
 
 from .cycles_bake import CyclesBake
@@ -109,7 +109,8 @@ def _run_cycles(
     subject: Subject, meter: Meter, baker: CyclesBake, denoiser: MapDenoiser, samples: int, seed: int
 ) -> list[Run]:
     values, cost = baker.run(samples, seed)
-    filtered, extra = meter.measured(lambda: denoiser.denoise(values))
+    # What Cycles left black lies under geometry, or on a border; the filter is not shown it, as it is not RTGI's.
+    filtered, extra = meter.measured(lambda: denoiser.denoise(values, valid=values.any(axis=1)))
     peaks = [c.peak_bytes for c in (cost, extra) if c.peak_bytes is not None]
     both = Cost(cost.seconds + extra.seconds, max(peaks, default=None))
     label = f"{samples} spp"

@@ -17,8 +17,8 @@ from typing import Any
 import bpy
 
 from .backend.errors import BakeError
-from .backend.packing import pack
-from .backend.sides import lit_sides
+from .backend.layout.packing import pack
+from .backend.layout.sides import lit_sides
 from .backend.stats import FrameStats
 from .extract import evaluate_materials, extract_source
 from .extract.source_scene import frame_kept

@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.errors import BakeError, Cancelled
-from .backend.geometry import Geometry
-from .backend.lights import is_dark
+from .backend.lamps.lights import is_dark
 from .backend.progress import Report
 from .backend.scene import Atlas, FrameState, LightMaps, Material, Scene
 from .backend.session import Session
 from .backend.stats import FrameStats
-from .backend.texels import Texels, place_texels
+from .backend.surface.geometry import Geometry
+from .backend.surface.texels import Texels, place_texels
 from .environment import device, library_folders, versions
 from .exr import write_page
 from .extract import frame_state

@@ -11,10 +11,10 @@ from __future__ import annotations
 import bpy
 import numpy as np
 
-from .backend.charts import in_metres, pack_islands, projectable_triangles, xatlas_charts
-from .backend.geometry import triangle_normals
-from .backend.islands import connected_triangles, overlapping_triangles, stretch, uv_islands
+from .backend.layout.charts import in_metres, pack_islands, projectable_triangles, xatlas_charts
+from .backend.layout.islands import connected_triangles, overlapping_triangles, stretch, uv_islands
 from .backend.scene import Bool, Float32, Int32
+from .backend.surface.geometry import triangle_normals
 from .smart_project import Faces, smart_project, whole_faces
 from .source import Layout, SourceMesh
 

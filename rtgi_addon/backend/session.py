@@ -14,23 +14,25 @@ from types import TracebackType
 
 import numpy as np
 
-from . import caustics, emission, photon_map, photons, radiosity
-from .bright import bright_targets
-from .direct import direct_irradiance, make_shadows
-from .finish import Finisher
-from .gather import GatherRays
-from .geometry import Geometry
-from .links import Links, trace_links
+from .final_gather import radiosity
+from .final_gather.bright import bright_targets
+from .final_gather.gather import GatherRays
+from .final_gather.links import Links, trace_links
+from .final_gather.radiosity import Illumination
+from .finish.finisher import Finisher
+from .lamps import emission
+from .lamps.direct import direct_irradiance, make_shadows
+from .lamps.sky import Sky, make_sky
 from .parallel import Workers
+from .photon import caustics, photon_map, photons
+from .photon.scatter import Surfaces, make_surfaces
 from .progress import Report, silent
-from .radiosity import Illumination
-from .scatter import Surfaces, make_surfaces
 from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
 from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts
-from .sky import Sky, make_sky
 from .stats import FrameStats
-from .texels import TexelFrame, make_texels, place_texels, texel_colours
-from .tracing import EmbreeTracer
+from .surface.geometry import Geometry
+from .surface.texels import TexelFrame, make_texels, place_texels, texel_colours
+from .surface.tracing import EmbreeTracer
 
 #: Each frame has so many stages to report.
 STAGE_COUNT = 6

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rtgi_addon.backend import lights as lt
+from rtgi_addon.backend.lamps import lights as lt
 from rtgi_addon.backend.sampling import photon_numbers, unit_float64
 from rtgi_addon.backend.scene import AreaShape, Light, LightKind
 

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rtgi_addon.backend.direct import direct_irradiance, make_shadows
-from rtgi_addon.backend.emission import PhotonSource, all_photons, make_bounds, make_sources, photon_counts
-from rtgi_addon.backend.geometry import Geometry
-from rtgi_addon.backend.lights import Bounds
+from rtgi_addon.backend.lamps.direct import direct_irradiance, make_shadows
+from rtgi_addon.backend.lamps.emission import PhotonSource, all_photons, make_bounds, make_sources, photon_counts
+from rtgi_addon.backend.lamps.lights import Bounds
 from rtgi_addon.backend.parallel import Workers
-from rtgi_addon.backend.photons import EnergyBook, PhotonPaths, trace_photons
-from rtgi_addon.backend.scatter import Surfaces, make_surfaces
+from rtgi_addon.backend.photon.photons import EnergyBook, PhotonPaths, trace_photons
+from rtgi_addon.backend.photon.scatter import Surfaces, make_surfaces
 from rtgi_addon.backend.scene import Atlas, FrameState, Scene
-from rtgi_addon.backend.texels import TexelFrame, Texels, make_texels, place_texels, texel_colours
-from rtgi_addon.backend.tracing import EmbreeTracer
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.texels import TexelFrame, Texels, make_texels, place_texels, texel_colours
+from rtgi_addon.backend.surface.tracing import EmbreeTracer
 
 
 @dataclass(frozen=True)

@@ -6,14 +6,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.caustics import (
+from rtgi_addon.backend.photon.caustics import (
     MOST_GENERATORS,
     caustic_irradiance,
     caustic_sources,
     find_generators,
     trace_caustics,
 )
-from rtgi_addon.backend.photon_map import caustic_hits
+from rtgi_addon.backend.photon.photon_map import caustic_hits
 from rtgi_addon.backend.scene import Instance, Light, LightKind, Material, Scene
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import box, grid_atlas, point_light, quad, sphere, translation

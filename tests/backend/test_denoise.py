@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.denoise import MOST_GAIN, MapDenoiser
-from rtgi_addon.backend.oidn import Denoiser, FilterKind, OidnError, find_oidn
+from rtgi_addon.backend.finish.denoise import MOST_GAIN, MapDenoiser
+from rtgi_addon.backend.finish.oidn import Denoiser, FilterKind, OidnError, find_oidn
 
 
 def bpy_libraries() -> list[Path]:

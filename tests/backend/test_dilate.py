@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.dilate import DilationMap, nearest_texel
+from rtgi_addon.backend.finish.dilate import DilationMap, nearest_texel
 
 
 def islands(seed: int, pages: int, size: int) -> tuple[np.ndarray, np.ndarray]:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.direct import MOST_SHEETS, direct_irradiance, lamp_irradiance, make_shadows
-from rtgi_addon.backend.photon_map import direct_hits
+from rtgi_addon.backend.lamps.direct import MOST_SHEETS, direct_irradiance, lamp_irradiance, make_shadows
+from rtgi_addon.backend.photon.photon_map import direct_hits
 from rtgi_addon.backend.scene import AreaShape, Instance, Light, LightKind, Material, Scene
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import cornell, grid_atlas, point_light, quad, sphere, translation

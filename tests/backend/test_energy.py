@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.photon_map import bounced_hits, direct_hits
+from rtgi_addon.backend.photon.photon_map import bounced_hits, direct_hits
 from rtgi_addon.backend.scene import Atlas, Instance, Light, LightKind, Material, Scene
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import box, constant_sky, cornell, grid_atlas, point_light, quad, sphere, translation

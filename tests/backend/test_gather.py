@@ -6,17 +6,17 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.bright import bright_targets
-from rtgi_addon.backend.gather import NO_TARGET, GatherRays
-from rtgi_addon.backend.geometry import Geometry
-from rtgi_addon.backend.links import trace_links
+from rtgi_addon.backend.final_gather.bright import bright_targets
+from rtgi_addon.backend.final_gather.gather import NO_TARGET, GatherRays
+from rtgi_addon.backend.final_gather.links import trace_links
+from rtgi_addon.backend.lamps.sky import make_sky
 from rtgi_addon.backend.parallel import Workers
-from rtgi_addon.backend.scatter import make_surfaces
+from rtgi_addon.backend.photon.scatter import make_surfaces
 from rtgi_addon.backend.scene import Instance, Scene, World
 from rtgi_addon.backend.settings import SampleCounts
-from rtgi_addon.backend.sky import make_sky
-from rtgi_addon.backend.texels import make_texels, place_texels, texel_colours
-from rtgi_addon.backend.tracing import EmbreeTracer
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.texels import make_texels, place_texels, texel_colours
+from rtgi_addon.backend.surface.tracing import EmbreeTracer
 from tests.backend import scenes
 
 

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend import lights as lt
-from rtgi_addon.backend.lamp_view import may_see, view_lamp
+from rtgi_addon.backend.lamps import lights as lt
+from rtgi_addon.backend.lamps.lamp_view import may_see, view_lamp
+from rtgi_addon.backend.lamps.spherical_rectangle import pdf_rectangle, sample_rectangle, see_rectangle
 from rtgi_addon.backend.scene import AreaShape, Light, LightKind
-from rtgi_addon.backend.spherical_rectangle import pdf_rectangle, sample_rectangle, see_rectangle
 from tests.backend.lamps import BOX, LAMPS, ORIGIN, POWER, lamp, numbers
 from tests.backend.scenes import translation
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from rtgi_addon.backend import lights as lt
-from rtgi_addon.backend.emission import MESHES, SKY, grown_bounds, make_bounds, make_sources, photon_counts
-from rtgi_addon.backend.geometry import Geometry
+from rtgi_addon.backend.lamps import lights as lt
+from rtgi_addon.backend.lamps.emission import MESHES, SKY, grown_bounds, make_bounds, make_sources, photon_counts
 from rtgi_addon.backend.scene import Instance, Light, LightKind, Material, Scene, World
+from rtgi_addon.backend.surface.geometry import Geometry
 from tests.backend.lamps import BOX, LAMPS, ORIGIN, POWER, numbers
 from tests.backend.scenes import box, constant_sky, quad, translation
 

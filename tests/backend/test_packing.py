@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.packing import Packing, instance_sizes, pack
+from rtgi_addon.backend.layout.packing import Packing, instance_sizes, pack
 from rtgi_addon.backend.scene import Instance, Mesh, Scene
 from tests.backend.scenes import WHITE, box, cornell, quad, translation
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from rtgi_addon.backend.parallel import Workers
-from rtgi_addon.backend.photon_map import (
+from rtgi_addon.backend.photon.photon_map import (
     PhotonMap,
     bounced_hits,
     caustic_hits,

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend import photons as ph
-from rtgi_addon.backend.emission import all_photons, photon_counts
-from rtgi_addon.backend.photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits
-from rtgi_addon.backend.photons import END_ABSORBED, END_CUT, END_ESCAPED, PhotonPaths, join_paths, take_paths
-from rtgi_addon.backend.scatter import choose, reflect, refract
+from rtgi_addon.backend.lamps.emission import all_photons, photon_counts
+from rtgi_addon.backend.photon import photons as ph
+from rtgi_addon.backend.photon.photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits
+from rtgi_addon.backend.photon.photons import END_ABSORBED, END_CUT, END_ESCAPED, PhotonPaths, join_paths, take_paths
+from rtgi_addon.backend.photon.scatter import choose, reflect, refract
 from rtgi_addon.backend.scene import Atlas, Instance, Material, Scene
 from tests.backend.rig import make_rig
 from tests.backend.scenes import box, cornell, grid_atlas, point_light, quad, sphere

@@ -8,11 +8,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.dilate import DilationMap
-from rtgi_addon.backend.geometry import Geometry
+from rtgi_addon.backend.finish.dilate import DilationMap
+from rtgi_addon.backend.finish.seams import SeamMatcher, find_seams
 from rtgi_addon.backend.scene import Atlas, Instance, Material, Mesh, Placement, Scene
-from rtgi_addon.backend.seams import SeamMatcher, find_seams
-from rtgi_addon.backend.texels import Texels, make_texels
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.texels import Texels, make_texels
 
 UP = np.float32([0, 0, 1])
 

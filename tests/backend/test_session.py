@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from rtgi_addon.backend.scene import Atlas, Instance, LightMaps, Material, Scene
 from rtgi_addon.backend.session import FrameStats, Session
 from rtgi_addon.backend.settings import AimBounced, AimDirect, BakeSettings, Quality
-from rtgi_addon.backend.texels import place_texels
+from rtgi_addon.backend.surface.texels import place_texels
 from tests.backend import scenes
 
 BARE = BakeSettings(denoise=False, quality=Quality.DRAFT, threads=1)

@@ -9,9 +9,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from rtgi_addon.backend.layout.sides import lit_sides
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.scene import Instance, Light, LightKind, Material, Mesh, Scene, World
-from rtgi_addon.backend.sides import lit_sides
 from tests.backend.scenes import (
     WHITE,
     box,

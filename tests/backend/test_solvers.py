@@ -9,7 +9,7 @@ import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.solvers import conjugate_gradients, solve_fixed_point
+from rtgi_addon.backend.final_gather.solvers import conjugate_gradients, solve_fixed_point
 
 
 def links(rng: np.random.Generator, count: int, sky: float = 1e-3) -> np.ndarray:

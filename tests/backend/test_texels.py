@@ -8,10 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.geometry import Geometry
-from rtgi_addon.backend.rasterise import rasterise
 from rtgi_addon.backend.scene import Atlas, Instance, Placement, Scene
-from rtgi_addon.backend.texels import make_texels, place_texels, texel_colours
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.rasterise import rasterise
+from rtgi_addon.backend.surface.texels import make_texels, place_texels, texel_colours
 from tests.backend import scenes
 
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.geometry import Geometry, triangle_normals
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.scene import Instance, Scene
-from rtgi_addon.backend.tracing import EmbreeTracer
+from rtgi_addon.backend.surface.geometry import Geometry, triangle_normals
+from rtgi_addon.backend.surface.tracing import EmbreeTracer
 from tests.backend import scenes
 
 UNIT_QUAD = scenes.quad("quad", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])

@@ -22,7 +22,7 @@ def main(zip_file: str, module: str, scene_file: str, result: Path) -> None:
     bpy.ops.extensions.package_install_files(filepath=zip_file, repo="user_default", enable_on_install=True)
     seen: dict[str, object] = {"enabled": addon_utils.check(module)[1]}
     package = importlib.import_module(f"{module}.rtgi_addon")
-    backend = importlib.import_module(f"{module}.rtgi_addon.backend.tracing")
+    backend = importlib.import_module(f"{module}.rtgi_addon.backend.surface.tracing")
     seen["backend"] = backend.__file__
     seen["commands"] = len(package._commands)
     for name in ("embreex", "scipy", "tqdm", "xatlas", "numpy"):

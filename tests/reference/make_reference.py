@@ -19,8 +19,8 @@ import numpy as np
 
 from bench.prepare import Prepared, prepare, texel_table
 from bench.reference import Reference, TexelTable
-from rtgi_addon.backend.geometry import world_bounds
 from rtgi_addon.backend.scene import Bool, Float64, Int32
+from rtgi_addon.backend.surface.geometry import world_bounds
 
 from .cycles_irradiance import CYCLES, LIFT, PointBaker, configure_cycles, undrawn_light
 from .surface_points import GRID, SurfacePoints, surface_points

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rtgi_addon.backend.scene import Float64, FrameState, Int32, Scene
-from rtgi_addon.backend.texels import BACK, Texels
+from rtgi_addon.backend.surface.texels import BACK, Texels
 
 #: Points per texel side.
 GRID = 4

@@ -1,0 +1,243 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Photon sources: lamps, emissive meshes and the sky behind one interface, and who emits how many photons.
+
+A source keeps its number (``light``) however many others come and go: lamps are numbered as in the frame's lights,
+all emissive meshes together are MESHES, the sky is SKY. Photons of the last two carry light that no shadow ray does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sampling import Discrete, make_discrete, sample_cosine_about, sample_triangle
+from ..scene import Bool, Float32, Float64, FrameState, Int32, Light, Material, Scene
+from ..surface.geometry import Geometry
+from ..surface.texels import sample_map
+from .lights import Bounds, Emission, emit_lamp, enter_box, is_dark, lamp_flux
+from .sky import Sky, make_sky
+
+Int64 = NDArray[np.int64]
+
+MESHES = -1
+SKY = -2
+
+#: Points of a triangle at which its emission map is averaged for the odds, and the least share of the map's own mean
+#: that a triangle gets, so that a bright pixel between the points is still found.
+_MAP_POINTS = 16
+_LEAST_SHARE = 0.05
+
+
+class PhotonSource(Protocol):
+    """What the photon tracer needs of a light."""
+
+    @property
+    def light(self) -> int:
+        """Its number in photon paths."""
+        ...
+
+    @property
+    def flux(self) -> Float64:
+        """(3,) W sent out; for sources with a map an estimate, used to share out photons."""
+        ...
+
+    def emit(self, numbers: list[Float64]) -> Emission:
+        """One photon for each of the numbers (EMISSION_DIMENSIONS arrays (n,) in [0, 1))."""
+        ...
+
+
+@dataclass(frozen=True)
+class LampSource:
+    """A lamp as photon source. ``casts_shadow`` is for shadow rays alone: a photon lands on what it meets."""
+
+    light: int
+    lamp: Light
+    origin: Float64  # (3,) world place of local space
+    bounds: Bounds
+
+    @property
+    def flux(self) -> Float64:
+        return lamp_flux(self.lamp, self.bounds)
+
+    def emit(self, numbers: list[Float64]) -> Emission:
+        return emit_lamp(self.lamp, numbers, origin=self.origin, bounds=self.bounds)
+
+
+@dataclass(frozen=True)
+class SkySource:
+    """The sky, entering through the faces of the scene's box; its patches drawn by radiance times solid angle."""
+
+    sky: Sky
+    bounds: Bounds
+    odds: Discrete
+    light: int = SKY
+
+    @property
+    def flux(self) -> Float64:
+        x, y, z = self.bounds.high - self.bounds.low
+        mean_outline = (x * y + y * z + z * x) / 2  # of a convex body: a quarter of its surface
+        return np.asarray(
+            (self.sky.radiance * self.sky.solid_angle[:, None]).sum(axis=0, dtype=np.float64) * mean_outline
+        )
+
+    def emit(self, numbers: list[Float64]) -> Emission:
+        patch, across = self.odds.sample(numbers[0])
+        travel = -self.sky.directions(patch, across.astype(np.float32), numbers[1].astype(np.float32)).astype(
+            np.float64
+        )
+        start, area = enter_box(travel, self.bounds, numbers[2], numbers[3], numbers[4])
+        share = self.sky.solid_angle[patch] * area / self.odds.pdf(patch)
+        return Emission(start, travel, self.sky.radiance[patch] * share[:, None])
+
+
+@dataclass(frozen=True)
+class MeshSource:
+    """All emissive triangles; an entry is one side of one triangle."""
+
+    scene: Scene
+    geometry: Geometry
+    triangle: Int32  # (m,) scene-wide
+    back: Bool  # (m,)
+    emission: Float32  # (m, 3) W/(m² sr), where there is no map
+    area: Float64  # (m,) m²
+    odds: Discrete
+    flux: Float64  # (3,) W
+    light: int = MESHES
+
+    def emit(self, numbers: list[Float64]) -> Emission:
+        entry, _ = self.odds.sample(numbers[4])
+        triangle = self.triangle[entry]
+        u, v = sample_triangle(numbers[2], numbers[3])
+        corners = self.geometry.corners[triangle].astype(np.float64)
+        start = corners[:, 0] * (1 - u - v)[:, None] + corners[:, 1] * u[:, None] + corners[:, 2] * v[:, None]
+        normal = self.geometry.normals[triangle] * np.where(self.back[entry], -1.0, 1.0)[:, None]
+        lift = self.geometry.offset_length(start.astype(np.float32))
+        radiance = mapped_emission(self.scene, self.geometry, triangle, u, v, self.emission[entry])
+        weight = radiance * (np.pi * self.area[entry] / self.odds.pdf(entry))[:, None]
+        direction = sample_cosine_about(normal, numbers[0], numbers[1])
+        return Emission(start + normal * lift[:, None], np.asarray(direction, np.float64), weight)
+
+
+def make_sources(
+    scene: Scene, state: FrameState, geometry: Geometry, bounds: Bounds, *, sides: Bool | None = None
+) -> list[PhotonSource]:
+    """All sources that send anything out. ``sides`` (instances, 2): does the front, the back send light (default all)?
+
+    ``bounds`` must hold everything that light can hit; keep it over the frames, since sun and sky photons start on it.
+    """
+    sources: list[PhotonSource] = []
+    for number, lamp in enumerate(state.lights):
+        if not is_dark(lamp) and max(lamp_flux(lamp, bounds)) > 0:
+            sources.append(LampSource(number, lamp, geometry.origin, bounds))
+    meshes = _mesh_source(scene, state, geometry, sides)
+    if meshes is not None:
+        sources.append(meshes)
+    sky = make_sky(state.world)
+    if sky is not None and not bounds.is_empty:
+        weights = np.maximum(sky.radiance.max(axis=1), 0) * sky.solid_angle
+        sources.append(SkySource(sky, bounds, make_discrete(weights)))
+    return sources
+
+
+def make_bounds(geometry: Geometry) -> Bounds:
+    """The box of all triangles, widened by a little so that it encloses flat scenes."""
+    if geometry.triangle_count == 0:
+        return Bounds(np.zeros(3), np.zeros(3))
+    corners = geometry.corners.reshape(-1, 3)
+    good = corners[np.isfinite(corners).all(axis=1)]
+    if not len(good):
+        return Bounds(np.zeros(3), np.zeros(3))
+    low, high = good.min(axis=0).astype(np.float64), good.max(axis=0).astype(np.float64)
+    margin = 1e-4 * float(np.sqrt(((high - low) ** 2).sum()))
+    return Bounds(low - margin, high + margin)
+
+
+def grown_bounds(bounds: Bounds, geometry: Geometry) -> Bounds:
+    """``bounds`` itself while it holds all triangles, else a box for both. Sun and sky photons start on the box, so one
+    that stays the same keeps their paths."""
+    now = make_bounds(geometry)
+    if bounds.is_empty or now.is_empty:
+        return now if bounds.is_empty else bounds
+    # The margin of `now` is not demanded: else a scene that only breathes would move the box in every frame.
+    slack = (now.high - now.low).max() * 1e-4
+    if np.all(now.low >= bounds.low - slack) and np.all(now.high <= bounds.high + slack):
+        return bounds
+    return Bounds(np.minimum(bounds.low, now.low), np.maximum(bounds.high, now.high))
+
+
+def photon_counts(sources: Sequence[PhotonSource], total: int) -> dict[int, int]:
+    """Photons of each light, by its brightest channel; every source gets at least one, so none is lost."""
+    flux = np.array([max(s.flux) for s in sources])
+    if not len(flux):
+        return {}
+    share = np.maximum(np.floor(flux / flux.sum() * total), 1).astype(np.int64)
+    share[int(np.argmax(flux))] += max(total - int(share.sum()), 0)
+    return {s.light: int(n) for s, n in zip(sources, share, strict=True)}
+
+
+def all_photons(counts: dict[int, int]) -> tuple[Int32, Int64]:
+    """((n,), (n,)) light and index of every photon of ``counts``."""
+    light = np.repeat(np.array(list(counts), np.int32), list(counts.values()))
+    index = np.concatenate([np.arange(n, dtype=np.int64) for n in counts.values()] or [np.zeros(0, np.int64)])
+    return light, index
+
+
+def _mesh_source(scene: Scene, state: FrameState, geometry: Geometry, sides: Bool | None) -> MeshSource | None:
+    materials = state.materials or scene.materials
+    mean = _mean_emission(scene, geometry, materials)  # (t, 3)
+    lit = np.array([i.blocks_light for i in scene.instances], np.bool_) & state.visible
+    sends = np.ones((len(scene.instances), 2), np.bool_) if sides is None else sides
+    glowing = (mean.max(axis=1, initial=0) > 0) & np.any(geometry.normals != 0, axis=1)
+    of_instance = geometry.instance_of_triangle
+    rows = [np.nonzero(glowing & (lit & sends[:, side])[of_instance])[0] for side in (0, 1)]
+    triangle = np.concatenate(rows).astype(np.int32)
+    if not len(triangle):
+        return None
+    edges = np.diff(geometry.corners[triangle].astype(np.float64), axis=1)
+    cross = np.cross(edges[:, 0], edges[:, 1])
+    area = np.sqrt((cross * cross).sum(axis=1)) / 2
+    flux = mean[triangle] * (np.pi * area)[:, None]
+    base = np.array([m.emission for m in materials], np.float32)[geometry.material_of_triangle[triangle]]
+    back = np.repeat([False, True], [len(r) for r in rows])
+    return MeshSource(
+        scene, geometry, triangle, back, base, area, make_discrete(flux.max(axis=1)), np.asarray(flux.sum(axis=0))
+    )
+
+
+def mapped_emission(
+    scene: Scene, geometry: Geometry, triangle: Int32, u: Float64, v: Float64, emission: Float32
+) -> Float32:
+    """(n, 3) W/(m² sr) at points of triangles: ``emission`` (n, 3), or the mesh's map where it has one."""
+    out = emission.copy()
+    instance = geometry.instance_of_triangle[triangle]
+    mesh_of_instance = np.array([i.mesh for i in scene.instances], np.int64)
+    for number, mesh in enumerate(scene.meshes):
+        if mesh.emission_map is None:
+            continue
+        rows = np.nonzero(mesh_of_instance[instance] == number)[0]
+        corner_uv = mesh.corner_uv[triangle[rows] - geometry.first_triangle[instance[rows]]]
+        weights = np.stack([1 - u[rows] - v[rows], u[rows], v[rows]], axis=1)[:, :, None]
+        out[rows] = sample_map(mesh.emission_map, (corner_uv * weights).sum(axis=1))
+    return np.maximum(out, 0)
+
+
+def _mean_emission(scene: Scene, geometry: Geometry, materials: Sequence[Material]) -> Float32:
+    """(t, 3) W/(m² sr), over each triangle; only the odds hang on it."""
+    table = np.array([m.emission for m in materials], np.float32).reshape(-1, 3)
+    mean: Float32 = np.maximum(table[geometry.material_of_triangle], 0)
+    step = (np.arange(_MAP_POINTS) + 0.5) / _MAP_POINTS
+    u, v = sample_triangle(step, (np.arange(_MAP_POINTS) * 0.618034) % 1)
+    weights = np.stack([1 - u - v, u, v], axis=1)  # (points, 3)
+    for number, instance in enumerate(scene.instances):
+        mesh = scene.meshes[instance.mesh]
+        if mesh.emission_map is None or not np.any(mesh.emission_map > 0):
+            continue
+        uv = np.einsum("pc,tcx->tpx", weights, mesh.corner_uv.astype(np.float64))  # (t, points, 2)
+        sampled = sample_map(mesh.emission_map, uv.reshape(-1, 2)).reshape(-1, _MAP_POINTS, 3)
+        least = np.maximum(mesh.emission_map, 0).mean(axis=(0, 1), dtype=np.float64) * _LEAST_SHARE
+        mean[geometry.triangles_of(number)] = np.maximum(sampled, 0).mean(axis=1) + least
+    return mean
