@@ -172,7 +172,7 @@ class Session:
             known = placed.emitted.copy()
             known[: self.texels.count] += placed.albedo * light.aim
             iim = end.denoise(light.iim, links.valid)
-            half = end.denoise(links.irradiance(known, half=0), links.valid)
+            half = end.denoise(links.irradiance(known, from_half=True), links.valid)
         return _Lit(placed.state.frame, samples, light.aim, iim, links.valid, noise_estimate(iim, half))
 
     # --- stages ---------------------------------------------------------------------------------------------------

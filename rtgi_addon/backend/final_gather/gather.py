@@ -10,7 +10,7 @@ Behind a mirror, glass or a see-through surface only cosine rays go on; what the
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -33,6 +33,7 @@ NO_TARGET = -1
 class TracedLinks:
     """Links of m texels, K rays each, cosine rays first; and of their rays' ways on behind mirrors."""
 
+    first: int  # number of the first texel
     target: Int32  # (m, K)
     weight: Float32  # (m, K)
     usable: Bool  # (m, K) False: the ray starts inside geometry, or leaves below the surface
@@ -41,12 +42,6 @@ class TracedLinks:
     beyond_target: Int32  # (b,)
     beyond_weight: Float32  # (b, 3)
     rays: int
-
-    @staticmethod
-    def join(parts: list[TracedLinks]) -> TracedLinks:
-        names = [f.name for f in fields(TracedLinks) if f.name != "rays"]
-        columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in names}
-        return TracedLinks(**columns, rays=sum(p.rays for p in parts))
 
 
 @dataclass(frozen=True)
@@ -81,6 +76,7 @@ class GatherRays:
             [bright.probability[:count] / area, bright.probability[count:] / (sky.solid_angle if sky else 1)]
         ).astype(np.float32)
         self._tangents = frames(frame.normal)
+        self._aim_points, self._aim_normals, self._aim_targets = self._aims()
 
     def trace(self, first: int, stop: int) -> TracedLinks:
         """The links of texels first..stop-1."""
@@ -99,7 +95,7 @@ class GatherRays:
             rays += cast
         row, beyond, throughput, cast = self._beyond(first, hits, fan.target.reshape(-1), fan.directions.reshape(-1, 3))
         return TracedLinks(
-            target, weight, usable, free.astype(np.float32), row, beyond, throughput, rays + cast
+            first, target, weight, usable, free.astype(np.float32), row, beyond, throughput, rays + cast
         )  # fmt: skip
 
     def _open_points(self, rows: slice, fan: _Fan) -> tuple[Bool, int]:
@@ -160,16 +156,15 @@ class GatherRays:
     def _aimed(self, rows: slice, pattern: Int32) -> tuple[Int32, Int32, Float32, int]:
         """((m, b) start point, (m, b) target, (m, b) weight, rays cast) of the aimed samples."""
         table = bright_patterns(self._samples.bright, self._seed)
-        points, normals, target_table = self._aims()
-        target = target_table[pattern]  # (m, b)
+        target = self._aim_targets[pattern]  # (m, b)
         is_sky = target >= self._texels.count
         origins = self._starts(rows, table.start[pattern])
-        ways = points[pattern] - np.where(is_sky[:, :, None], np.float32(0), origins)
+        ways = self._aim_points[pattern] - np.where(is_sky[:, :, None], np.float32(0), origins)
         distance2 = np.einsum("mbj,mbj->mb", ways, ways)
         distance = np.sqrt(np.maximum(distance2, np.finfo(np.float32).tiny))
         cos_here = np.einsum("mbj,mj->mb", ways, self._frame.normal[rows]) / distance
         above = np.einsum("mbj,mj->mb", ways, self._frame.geometric_normal[rows]) > 0
-        cos_there = -np.einsum("mbj,mbj->mb", ways, normals[pattern]) / distance
+        cos_there = -np.einsum("mbj,mbj->mb", ways, self._aim_normals[pattern]) / distance
         seen = (cos_here > 0) & above & (is_sky | (cos_there > 1e-6))
         density = self._density[target] * np.where(is_sky, np.float32(1), distance2 / np.maximum(cos_there, 1e-6))
         n_c, n_b = np.float32(self._samples.cosine), np.float32(self._samples.bright)
@@ -228,19 +223,18 @@ class GatherRays:
     def _aims(self) -> tuple[Float32, Float32, Int32]:
         """Per pattern: (P, b, 3) point on the target, lifted (or direction to the sky), (P, b, 3) its normal,
         (P, b) the target."""
-        if not hasattr(self, "_aim_table"):
-            table = bright_patterns(self._samples.bright, self._seed)
-            shape = table.choice.shape
-            target = np.searchsorted(self._bright.cdf, table.choice.reshape(-1), side="right") - 1
-            target = np.minimum(target, len(self._bright.probability) - 1).astype(np.int32)
-            points, normals = np.zeros((len(target), 3), np.float32), np.zeros((len(target), 3), np.float32)
-            solid = target < self._texels.count
-            t, on = target[solid], (table.target.reshape(-1, 2)[solid, 0] * POINTS).astype(np.int64)
-            points[solid] = self._frame.points[t, on]
-            facing = np.where(self._texels.side[t] == BACK, np.float32(-1), np.float32(1))
-            normals[solid] = self._geometry.normals[self._texels.point_triangle[t, on]] * facing[:, None]
-            if self._sky is not None:
-                on = table.target.reshape(-1, 2)[~solid]
-                points[~solid] = self._sky.directions(target[~solid] - self._texels.count, on[:, 0], on[:, 1])
-            self._aim_table = points.reshape(*shape, 3), normals.reshape(*shape, 3), target.reshape(shape)
-        return self._aim_table
+        table = bright_patterns(self._samples.bright, self._seed)
+        shape = table.choice.shape
+        target = np.searchsorted(self._bright.cdf, table.choice.reshape(-1), side="right") - 1
+        target = np.clip(target, 0, max(len(self._bright.probability) - 1, 0)).astype(np.int32)
+        points, normals = np.zeros((len(target), 3), np.float32), np.zeros((len(target), 3), np.float32)
+        solid = (target < self._texels.count) & self._bright.any
+        t, on = target[solid], (table.target.reshape(-1, 2)[solid, 0] * POINTS).astype(np.int64)
+        points[solid] = self._frame.points[t, on]
+        facing = np.where(self._texels.side[t] == BACK, np.float32(-1), np.float32(1))
+        normals[solid] = self._geometry.normals[self._texels.point_triangle[t, on]] * facing[:, None]
+        if self._sky is not None and self._bright.any:
+            on_sky = table.target.reshape(-1, 2)[~solid]
+            patch = target[~solid] - self._texels.count
+            points[~solid] = self._sky.directions(patch, on_sky[:, 0], on_sky[:, 1])
+        return points.reshape(*shape, 3), normals.reshape(*shape, 3), target.reshape(shape)

@@ -25,20 +25,19 @@ LEAST_FREE_SHARE = 0.9
 
 @dataclass(frozen=True)
 class Links:
-    """n texels' links to m targets (texels first, then sky patches)."""
+    """n texels' links to m targets (texels first, then sky patches). 12 bytes a link."""
 
     matrix: sparse.csr_matrix  # (n, m) float32, rows sum to the share of rays that ended on a target
-    halves: tuple[sparse.csr_matrix, sparse.csr_matrix]  # the matrix from either half of the rays alone
+    half: sparse.csr_matrix  # the same from half of the rays alone
     beyond: tuple[sparse.csr_matrix, ...]  # three (n, m), one a channel: by mirror and glass; () where there are none
     valid: Bool  # (n,) False: the texel lies under other geometry
     rays: int
 
-    def irradiance(self, radiosity: Float32, *, half: int | None = None) -> Float32:
-        """(n, 3) W/m² from the radiosity (m, 3) of all targets; ``half`` 0 or 1: estimated from that half's rays."""
-        matrix = self.matrix if half is None else self.halves[half]
-        direct = np.asarray(matrix @ radiosity, np.float32)
+    def irradiance(self, radiosity: Float32, *, from_half: bool = False) -> Float32:
+        """(n, 3) W/m² from the radiosity (m, 3) of all targets; ``from_half``: as half of the rays estimate it."""
+        direct = np.asarray((self.half if from_half else self.matrix) @ radiosity, np.float32)
         if self.beyond:
-            # Both halves share these rays; their noise is not in the difference of the halves.
+            # The half shares these rays: their noise is not in its difference from the whole.
             direct += np.stack([m @ radiosity[:, k] for k, m in enumerate(self.beyond)], axis=1)
         return direct
 
@@ -48,48 +47,84 @@ def trace_links(
 ) -> Links:
     """Links of all texels."""
     chunk = max(1, CHUNK_RAYS // samples.total)
-    parts = workers.map_slices(lambda s: tracer.trace(s.start, s.stop), texel_count, chunk)
-    if not parts:
-        empty = sparse.csr_matrix((0, target_count), dtype=np.float32)
-        return Links(empty, (empty, empty), (), np.zeros(0, np.bool_), 0)
-    traced = TracedLinks.join(parts)
-    weight = traced.weight * traced.usable
-    first = _first_half(weight.shape[1], samples)
-    matrices = [_matrix(traced.target, weight, columns, target_count) for columns in (slice(None), first, ~first)]
-    beyond = _beyond_matrices(traced, weight, target_count) if len(traced.beyond_row) else ()
-    return Links(matrices[0], (matrices[1], matrices[2]), beyond, traced.free >= LEAST_FREE_SHARE, traced.rays)
-
-
-def _beyond_matrices(traced: TracedLinks, weight: Float32, target_count: int) -> tuple[sparse.csr_matrix, ...]:
-    """One matrix a channel, its rows scaled as the plain links' are."""
-    scale = _row_scale(weight)
-    place = (traced.beyond_row, traced.beyond_target)
-    shape = (len(weight), target_count)
-    return tuple(
-        sparse.coo_matrix((traced.beyond_weight[:, k] * scale[traced.beyond_row], place), shape=shape).tocsr()
-        for k in range(3)
+    parts = workers.map_slices(lambda s: _packed(tracer.trace(s.start, s.stop), samples), texel_count, chunk)
+    shape = (texel_count, target_count)
+    return Links(
+        matrix=_joined([p.whole for p in parts], shape),
+        half=_joined([p.half for p in parts], shape),
+        beyond=_beyond_matrices([p.beyond for p in parts], shape),
+        valid=np.concatenate([np.zeros(0, np.bool_), *(p.valid for p in parts)]),
+        rays=sum(p.rays for p in parts),
     )
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """Some rows of a sparse matrix, packed."""
+
+    weight: Float32  # (k,)
+    target: Int32  # (k,)
+    count: Int32  # (m,) entries of each row
+
+
+@dataclass(frozen=True)
+class _Packed:
+    """The links of m texels without the rays that ended nowhere."""
+
+    whole: _Rows
+    half: _Rows
+    beyond: tuple[Int32, Int32, Float32]  # (b,) texel, (b,) target, (b, 3) weight
+    valid: Bool  # (m,)
+    rays: int
+
+
+def _packed(traced: TracedLinks, samples: SampleCounts) -> _Packed:
+    """Rows scaled to sum to one over all rays, the ones that ended nowhere included."""
+    weight = traced.weight * traced.usable
+    scale = _row_scale(weight)
+    first = _first_half(weight.shape[1], samples)
+    beyond_scale = scale[traced.beyond_row - traced.first][:, None]
+    return _Packed(
+        whole=_rows(traced.target, weight, scale),
+        half=_rows(traced.target[:, first], weight[:, first], _row_scale(weight[:, first])),
+        beyond=(traced.beyond_row, traced.beyond_target, traced.beyond_weight * beyond_scale),
+        valid=traced.free >= LEAST_FREE_SHARE,
+        rays=traced.rays,
+    )
+
+
+def _rows(target: Int32, weight: Float32, scale: Float32) -> _Rows:
+    kept = (weight > 0) & (target != NO_TARGET)
+    return _Rows((weight * scale[:, None])[kept], target[kept], kept.sum(axis=1, dtype=np.int32))
+
+
+def _joined(parts: list[_Rows], shape: tuple[int, int]) -> sparse.csr_matrix:
+    """All rows as one matrix."""
+    counts = np.concatenate([np.zeros(1, np.int64), *(p.count for p in parts)])
+    weight = np.concatenate([np.zeros(0, np.float32), *(p.weight for p in parts)])
+    target = np.concatenate([np.zeros(0, np.int32), *(p.target for p in parts)])
+    return sparse.csr_matrix((weight, target, np.cumsum(counts)), shape=shape)
+
+
+def _beyond_matrices(
+    parts: list[tuple[Int32, Int32, Float32]], shape: tuple[int, int]
+) -> tuple[sparse.csr_matrix, ...]:
+    """One matrix a channel, or none where no ray went on."""
+    if not any(len(row) for row, _, _ in parts):
+        return ()
+    row, target, weight = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return tuple(sparse.coo_matrix((weight[:, k], (row, target)), shape=shape).tocsr() for k in range(3))
+
+
 def _row_scale(weight: Float32) -> Float32:
-    """(n,) what makes each row of ``weight`` (n, K) sum to one; 0 for a row of zeros."""
+    """(m,) what makes each row of ``weight`` (m, K) sum to one; 0 for a row of zeros."""
     total = weight.sum(axis=1, dtype=np.float64)
     return np.asarray(np.divide(1.0, total, out=np.zeros_like(total), where=total > 0), np.float32)
 
 
 def _first_half(columns: int, samples: SampleCounts) -> Bool:
-    """(columns,) the first half of the cosine rays and of the aimed ones; each half is well spread by itself."""
+    """(columns,) the first half of the cosine rays and of the aimed ones, well spread by itself."""
     number = np.arange(columns)
     return np.where(
         number < samples.cosine, number < samples.cosine // 2, number - samples.cosine < samples.bright // 2
     )
-
-
-def _matrix(target: Int32, weight: Float32, columns: slice | Bool, target_count: int) -> sparse.csr_matrix:
-    """Rows scaled to sum to one over all rays, the ones that ended nowhere included."""
-    target, weight = target[:, columns], weight[:, columns]
-    scale = _row_scale(weight)
-    kept = (weight > 0) & (target != NO_TARGET)
-    start = np.concatenate([[0], np.cumsum(kept.sum(axis=1))]).astype(np.int32)
-    data = (weight * scale[:, None])[kept]
-    return sparse.csr_matrix((data, target[kept], start), shape=(len(target), target_count))
