@@ -19,15 +19,16 @@ from .final_gather.bright import bright_targets
 from .final_gather.gather import GatherRays
 from .final_gather.links import Links, trace_links
 from .final_gather.radiosity import Illumination
-from .finish.finisher import Finisher
+from .finish.finisher import Finisher, fill
 from .lamps import emission
 from .lamps.direct import direct_irradiance, make_shadows
 from .lamps.sky import Sky, make_sky
+from .limits import bounded_scene, bounded_state
 from .parallel import Workers
 from .photon import caustics, photon_map, photons
-from .photon.scatter import Surfaces, make_surfaces
+from .photon.scatter import Surfaces, diffuse_shares, make_surfaces
 from .progress import Report, silent
-from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
+from .scene import Atlas, Bool, Float32, FrameState, Int32, LightMaps, Scene
 from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts
 from .stats import FrameStats
 from .surface.geometry import Geometry
@@ -59,7 +60,7 @@ class _Placed:
     state: FrameState
     frame: TexelFrame
     surfaces: Surfaces
-    albedo: Float32  # (n, 3)
+    albedo: Float32  # (n, 3) share of the light arriving that leaves diffusely: albedo × opacity
     emitted: Float32  # (m, 3) radiosity that targets send of themselves, W/m²
     sky: Sky | None
 
@@ -72,7 +73,7 @@ class _Lit:
     samples: SampleCounts
     aim: Float32  # (n, 3) W/m²
     iim: Float32  # (n, 3) W/m², denoised
-    valid: Bool  # (n,)
+    stand_in: Int32  # (n,) see Links
     estimated_error: float | None
 
 
@@ -93,6 +94,8 @@ class Session:
 
         Raises BakeError when the settings ask for what this machine does not have.
         """
+        scene, self._bounded = bounded_scene(scene)
+        state, _ = bounded_state(state, scene)
         self.scene, self.atlas, self.settings = scene, atlas, settings
         self._report = report
         self._workers = Workers(settings.threads)
@@ -119,6 +122,8 @@ class Session:
     def advance(self, state: FrameState) -> FrameResult:
         """Light the frame ``state``."""
         stats = FrameStats(texels_updated=self.texels.count, surfaces_updated=self.texels.surface_count)
+        state, changed = bounded_state(state, self.scene)
+        stats.warnings += dict.fromkeys([*self._bounded, *changed])
         with stats.stage("place"):
             placed = self._place(state)
         self._report("place", 1, STAGE_COUNT)
@@ -171,9 +176,9 @@ class Session:
             end = self._finisher
             known = placed.emitted.copy()
             known[: self.texels.count] += placed.albedo * light.aim
-            iim = end.denoise(light.iim, links.valid)
-            half = end.denoise(links.irradiance(known, from_half=True), links.valid)
-        return _Lit(placed.state.frame, samples, light.aim, iim, links.valid, noise_estimate(iim, half))
+            iim = end.denoise(light.iim, links.stand_in)
+            half = end.denoise(links.irradiance(known, from_half=True), links.stand_in)
+        return _Lit(placed.state.frame, samples, light.aim, iim, links.stand_in, noise_estimate(iim, half))
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
@@ -189,7 +194,7 @@ class Session:
         emitted = glow * np.float32(np.pi)
         if sky is not None:
             emitted = np.concatenate([emitted, sky.radiance * np.float32(np.pi)])
-        return _Placed(state, frame, surfaces, np.clip(albedo, 0, 1), emitted, sky)
+        return _Placed(state, frame, surfaces, diffuse_shares(surfaces, self.texels.triangle), emitted, sky)
 
     def _direct(self, placed: _Placed, stats: FrameStats) -> Float32:
         """(n, 3) from lamps, by shadow rays; by photons when the settings say so."""
@@ -232,7 +237,7 @@ class Session:
             self.texels, placed.frame, self.geometry, placed.surfaces, self._tracer, placed.sky, bright, samples,
             max_specular=self.settings.max_specular, seed=self.settings.seed,
         )  # fmt: skip
-        links = trace_links(tracer, self.texels.count, len(placed.emitted), samples, self._workers)
+        links = trace_links(tracer, self.texels, len(placed.emitted), samples, self._workers)
         stats.rays += links.rays
         stats.links_traced += links.rays
         stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
@@ -269,9 +274,9 @@ class Session:
         return LightMaps(
             frame=placed.state.frame,
             iim=end.to_pages(iim),
-            aim=end.to_pages(end.fill(lit.aim, lit.valid)),
-            caustics=None if caustic is None else end.to_pages(end.fill(caustic, lit.valid)),
-            valid=end.valid_pages(lit.valid),
+            aim=end.to_pages(fill(lit.aim, lit.stand_in)),
+            caustics=None if caustic is None else end.to_pages(fill(caustic, lit.stand_in)),
+            valid=end.valid_pages(lit.stand_in == np.arange(self.texels.count)),
         )
 
 

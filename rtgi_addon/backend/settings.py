@@ -63,9 +63,9 @@ class SampleCounts:
         return self.cosine + self.bright
 
 
-#: Rays per texel by quality; DESIGN's measured points (draft ≈ 5 %, preview ≈ 4 %, final ≈ 3.5 % on the Cornell box).
+#: Rays per texel by quality: about 4 %, 2 % and 1 % error on the Cornell box at 128² (docs/benchmarks.md).
 SAMPLES_OF_QUALITY = {
-    Quality.DRAFT: SampleCounts(16, 16),
+    Quality.DRAFT: SampleCounts(8, 8),
     Quality.PREVIEW: SampleCounts(32, 32),
     Quality.FINAL: SampleCounts(128, 128),
 }

@@ -71,7 +71,7 @@ def test_half_of_the_rays_estimates_the_same_light():
     scene, atlas = scenes.cornell(16)
     samples = SampleCounts(32, 32)
     rays, texels, frame, _, targets = gather_of(scene, atlas, lambda t, f: f.position[:, 2] > 0.9, samples)
-    links = trace_links(rays, texels.count, targets, samples, Workers(1))
+    links = trace_links(rays, texels, targets, samples, Workers(1))
     radiosity = np.repeat((frame.position[:, 2:] > 0.9), 3, axis=1).astype(np.float32)
     whole, half = links.irradiance(radiosity), links.irradiance(radiosity, from_half=True)
     assert half.mean() == pytest.approx(whole.mean(), rel=0.01)
@@ -93,7 +93,7 @@ def test_one_bright_patch_of_sky_lights_like_the_sun(row):
     scene, atlas = floor_under(World(image))
     samples = SampleCounts(16, 16)
     rays, texels, _, sky, targets = gather_of(scene, atlas, None, samples)
-    links = trace_links(rays, texels.count, targets, samples, Workers(1))
+    links = trace_links(rays, texels, targets, samples, Workers(1))
     radiosity = np.zeros((targets, 3), np.float32)
     radiosity[texels.count :] = sky.radiance * np.pi
     patch = row * 128 + 70

@@ -127,7 +127,8 @@ class GatherRays:
 
     def _starts(self, rows: slice, start: Int32) -> Float32:
         """(m, c, 3) ray origins: the points ``start`` (m, c) of each texel."""
-        return np.take_along_axis(self._frame.points[rows], start[:, :, None], axis=1)
+        number = start + (np.arange(rows.start, rows.stop, dtype=np.int32) * np.int32(POINTS))[:, None]
+        return self._frame.points.reshape(-1, 3).take(number, axis=0)
 
     def _cosine(self, rows: slice, pattern: Int32) -> tuple[_Fan, Hits]:
         table = cosine_patterns(self._samples.cosine, self._seed)
@@ -141,6 +142,8 @@ class GatherRays:
         escaped = hits.triangle < 0
         target = self._targets(hits, flat_directions)
         dark_side = (target < 0) & ~escaped
+        if self._see_through:
+            dark_side &= ~self._goes_on(hits.triangle)
         per_area = hits.distance * hits.distance / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
         density = self._density.take(target, mode="clip") * np.where(escaped, np.float32(1), per_area)
         density[target < 0] = 0

@@ -16,6 +16,7 @@ from scipy import sparse
 from ..parallel import CHUNK_RAYS, Workers
 from ..scene import Bool, Float32, Int32
 from ..settings import SampleCounts
+from ..surface.texels import Texels, stand_ins
 from .gather import NO_TARGET, GatherRays, TracedLinks
 
 #: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
@@ -30,8 +31,13 @@ class Links:
     matrix: sparse.csr_matrix  # (n, m) float32, rows sum to the share of rays that ended on a target
     half: sparse.csr_matrix  # the same from half of the rays alone
     beyond: tuple[sparse.csr_matrix, ...]  # three (n, m), one a channel: by mirror and glass; () where there are none
-    valid: Bool  # (n,) False: the texel lies under other geometry
+    stand_in: Int32  # (n,) texel whose light stands for each; itself unless it lies under other geometry; -1: none
     rays: int
+
+    @property
+    def valid(self) -> Bool:
+        """(n,) False: the texel lies under other geometry."""
+        return np.asarray(self.stand_in == np.arange(len(self.stand_in)))
 
     def irradiance(self, radiosity: Float32, *, from_half: bool = False) -> Float32:
         """(n, 3) W/m² from the radiosity (m, 3) of all targets; ``from_half``: as half of the rays estimate it."""
@@ -43,19 +49,39 @@ class Links:
 
 
 def trace_links(
-    tracer: GatherRays, texel_count: int, target_count: int, samples: SampleCounts, workers: Workers
+    tracer: GatherRays, texels: Texels, target_count: int, samples: SampleCounts, workers: Workers
 ) -> Links:
     """Links of all texels."""
     chunk = max(1, CHUNK_RAYS // samples.total)
-    parts = workers.map_slices(lambda s: _packed(tracer.trace(s.start, s.stop), samples), texel_count, chunk)
-    shape = (texel_count, target_count)
+    parts = workers.map_slices(lambda s: _packed(tracer.trace(s.start, s.stop), samples), texels.count, chunk)
+    shape = (texels.count, target_count)
+    stand_in = stand_ins(texels, np.concatenate([np.zeros(0, np.bool_), *(p.valid for p in parts)]))
+    seen_as = np.concatenate([stand_in, np.arange(texels.count, target_count, dtype=np.int32)])
     return Links(
-        matrix=_joined([p.whole for p in parts], shape),
-        half=_joined([p.half for p in parts], shape),
-        beyond=_beyond_matrices([p.beyond for p in parts], shape),
-        valid=np.concatenate([np.zeros(0, np.bool_), *(p.valid for p in parts)]),
+        matrix=_redirected(_joined([p.whole for p in parts], shape), seen_as),
+        half=_redirected(_joined([p.half for p in parts], shape), seen_as),
+        beyond=tuple(_redirected(m, seen_as) for m in _beyond_matrices([p.beyond for p in parts], shape)),
+        stand_in=stand_in,
         rays=sum(p.rays for p in parts),
     )
+
+
+def _redirected(matrix: sparse.csr_matrix, seen_as: Int32) -> sparse.csr_matrix:
+    """``matrix`` (n, m) with each target replaced by ``seen_as`` (m,).
+
+    A target that is not valid has no light of its own, though a sliver of it may be in sight. Where nothing stands for
+    it (-1) the link is dropped and the rest of its row made up for it.
+    """
+    if np.array_equal(seen_as, np.arange(len(seen_as))):
+        return matrix
+    target = seen_as[matrix.indices]
+    kept = np.where(target >= 0, matrix.data, np.float32(0))
+    if (target < 0).any():
+        before = np.asarray(matrix.sum(axis=1), np.float64).ravel()
+        row = np.repeat(np.arange(matrix.shape[0]), np.diff(matrix.indptr))
+        after = np.bincount(row, kept, minlength=matrix.shape[0])
+        kept = kept * np.divide(before, after, out=np.zeros_like(before), where=after > 0).astype(np.float32)[row]
+    return sparse.csr_matrix((kept, np.maximum(target, 0), matrix.indptr), shape=matrix.shape)
 
 
 @dataclass(frozen=True)

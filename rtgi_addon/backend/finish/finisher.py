@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ..scene import Atlas, Bool, Float32, Int32, Scene
 from ..settings import BakeSettings
@@ -54,21 +53,14 @@ class Finisher:
             self.warnings.append(f"{fault}: maps are not denoised; use --quality final")
             return None
 
-    def fill(self, values: Float32, valid: Bool) -> Float32:
-        """``values`` (n, 3) with each texel that is not ``valid`` taking the nearest valid one of its surface; zero
-        where a surface has none."""
-        if valid.all():
-            return values
-        source = nearest_valid(self._texels, valid)
-        return np.where((source >= 0)[:, None], values[source], np.float32(0))
-
-    def denoise(self, values: Float32, valid: Bool) -> Float32:
-        """``values`` (n, 3) filtered; texels that are not ``valid`` get what the filter makes of their surroundings.
+    def denoise(self, values: Float32, stand_in: Int32) -> Float32:
+        """``values`` (n, 3) filtered; texels that are not valid get what the filter makes of their surroundings.
 
         Where there is no denoiser they are only filled.
         """
         if self._denoiser is None:
-            return self.fill(values, valid)
+            return fill(values, stand_in)
+        valid = stand_in == np.arange(len(stand_in))
         return self._denoiser.denoise(np.maximum(values, 0), valid=valid)
 
     def close_seams(self, values: Float32) -> Float32:
@@ -87,16 +79,6 @@ class Finisher:
         return pages
 
 
-def nearest_valid(texels: Texels, valid: Bool) -> Int32:
-    """(n,) for each texel the nearest valid one of its surface on the page, itself where valid, -1 where none is."""
-    source = np.arange(texels.count, dtype=np.int32)
-    lost, good = np.nonzero(~valid)[0], np.nonzero(valid)[0]
-    if not len(good):
-        return np.full(texels.count, -1, np.int32)
-    # Surfaces lie so far apart along the third axis that the nearest texel is one's own surface's if it has any.
-    apart = 4.0 * max(texels.index.shape[1:])
-    place = np.stack([texels.row, texels.col, texels.surface * apart], axis=1).astype(np.float64)
-    _, nearest = cKDTree(place[good]).query(place[lost])
-    found = good[nearest]
-    source[lost] = np.where(texels.surface[found] == texels.surface[lost], found, -1)
-    return source
+def fill(values: Float32, stand_in: Int32) -> Float32:
+    """``values`` (n, 3) of each texel's stand-in (see ``texels.stand_ins``); zero where it has none."""
+    return np.where((stand_in >= 0)[:, None], values[stand_in], np.float32(0))

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
+from scipy.spatial import cKDTree
 
 from ..scene import Atlas, Bool, Float32, Float64, Int32, Material, Mesh, Placement, Scene
 from .geometry import Geometry, unit
@@ -222,6 +223,25 @@ def _widened(index: Int32) -> Int32:
             neighbour = before[:, dy : dy + index.shape[1], dx : dx + index.shape[2]]
             np.copyto(wide, neighbour, where=wide < 0)
     return wide
+
+
+def stand_ins(texels: Texels, valid: Bool) -> Int32:
+    """(n,) the texel whose light stands for each: itself where ``valid``, else the nearest valid one of its surface on
+    the page; -1 where its surface has none."""
+    source = np.arange(texels.count, dtype=np.int32)
+    lost, good = np.nonzero(~valid)[0], np.nonzero(valid)[0]
+    if not len(lost):
+        return source
+    source[lost] = -1
+    if not len(good):
+        return source
+    # Surfaces lie so far apart along the third axis that the nearest texel is one's own surface's if it has any.
+    apart = 4.0 * max(texels.index.shape[1:])
+    place = np.stack([texels.row, texels.col, texels.surface * apart], axis=1).astype(np.float64)
+    _, nearest = cKDTree(place[good]).query(place[lost])
+    own = texels.surface[good[nearest]] == texels.surface[lost]
+    source[lost[own]] = good[nearest[own]]
+    return source
 
 
 def place_texels(texels: Texels, geometry: Geometry) -> TexelFrame:
