@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtgi_addon.backend.finish.dilate import DilationMap
-from rtgi_addon.backend.finish.seams import SeamMatcher, find_seams
+from rtgi_addon.backend.finish.seams import LEAST_TEXELS, SeamMatcher, find_seams
 from rtgi_addon.backend.scene import Atlas, Instance, Material, Mesh, Placement, Scene
 from rtgi_addon.backend.surface.geometry import Geometry
 from rtgi_addon.backend.surface.texels import Texels, make_texels
@@ -220,3 +220,14 @@ def test_a_smooth_shaded_rim_is_no_seam():
     assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 0
     bent[1] = np.sin(0.5), 0, np.cos(0.5)  # 29°: a tube of thirteen sides
     assert len(find_seams(triangles, uv, normals, face_normals=bent).uv_a) == 1
+
+
+def test_islands_of_few_texels_keep_their_own_light():
+    """Their cuts differ by the width of a texel; the same patchwork on more texels is matched."""
+    coarse, texels = matcher_of(patchwork(4), resolution=24)
+    assert np.bincount(texels.surface).max() < LEAST_TEXELS
+    values = lit(texels)
+    assert coarse.match(values) is values
+    fine, texels = matcher_of(patchwork(4), resolution=128)
+    assert np.bincount(texels.surface).min() >= LEAST_TEXELS
+    assert fine.texel_count > 0
