@@ -103,7 +103,9 @@ def _nearest(
     texel_area = frame.area[rows].astype(np.float64)
     wide = disk > texel_area
     disk *= _share_on_surface(texels, frame, workers, rows, np.where(wide, radius, 0), apart)
-    out = flux / np.maximum(disk, np.finfo(np.float32).tiny)[:, None]
+    # k photons at one point, on a surface without extent: nothing to spread them over.
+    solid = (disk > np.finfo(np.float32).tiny)[:, None]
+    out = np.divide(flux, disk[:, None], out=np.zeros_like(flux), where=solid)
     per_texel = _mean_irradiance(photons.flux, photons.texel, frame.area.astype(np.float64))
     return np.where(wide[:, None], out, per_texel[rows])
 
@@ -131,7 +133,7 @@ def _share_on_surface(
     places = _with_surface(frame.position, texels.surface, apart)
     border = _border_texels(texels)
     to_border, _ = cKDTree(places[border]).query(places[rows], workers=workers.count)
-    near = np.nonzero((radius > 0) & (to_border < radius + width))[0]
+    near = np.nonzero((radius > 0) & (width > 0) & (to_border < radius + width))[0]
     if not len(near):
         return share
     tree = cKDTree(places, leafsize=32)

@@ -74,6 +74,17 @@ def make_surfaces(geometry: Geometry, texels: Texels, albedo: Float32, materials
     )
 
 
+def diffuse_shares(surfaces: Surfaces, triangle: Int32) -> Float32:
+    """(n, 3) share of the light arriving at each texel that leaves diffusely, as :func:`scatter` has it.
+
+    ``triangle`` (n,) of the texels.
+    """
+    material = surfaces.material_of_triangle[triangle]
+    albedo = surfaces.albedo[: len(triangle)]
+    others = surfaces.specular[material] + surfaces.transmission[material]
+    return np.asarray(albedo * (surfaces.opacity[material][:, None] / np.maximum(albedo + others, 1)), np.float32)
+
+
 def scatter(
     surfaces: Surfaces,
     hits: Hits,
