@@ -18,6 +18,7 @@ import numpy as np
 from .backend.errors import BakeError
 from .backend.scene import Bool, Float32
 from .output import whole_file
+from .scenes import remove_scene
 
 
 def write_page(path: str | os.PathLike[str], rgb: Float32, valid: Bool) -> None:
@@ -88,4 +89,4 @@ def _exr_scene() -> Iterator[bpy.types.Scene]:
         settings.exr_codec = "ZIP"
         yield scene
     finally:
-        bpy.data.scenes.remove(scene)
+        remove_scene(scene)

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.scene import Bool, Float32, Int32
+from .scenes import remove_scene
 from .source import SourceMesh
 
 Int64 = NDArray[np.int64]
@@ -61,7 +62,7 @@ def smart_project(vertices: Float32, triangles: Int32, faces: Faces) -> Float32:
         return uv.reshape(-1, 2)[loop_of_corner]
     finally:
         bpy.data.objects.remove(target)
-        bpy.data.scenes.remove(scene)
+        remove_scene(scene)
         bpy.data.meshes.remove(mesh)
 
 

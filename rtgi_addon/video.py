@@ -10,6 +10,7 @@ import bpy
 
 from .backend.errors import BakeError
 from .output import whole_file
+from .scenes import remove_scene
 
 
 def write_video(path: Path, pictures: Sequence[Path], *, fps: int, fps_base: float) -> None:
@@ -29,7 +30,7 @@ def write_video(path: Path, pictures: Sequence[Path], *, fps: int, fps_base: flo
         reason = str(error).strip().splitlines()[0].removeprefix("Error: ")
         raise BakeError(f"{path}: the video cannot be written ({reason}); the pictures are whole") from error
     finally:
-        bpy.data.scenes.remove(scene)
+        remove_scene(scene)
 
 
 def _lay_out(scene: bpy.types.Scene, pictures: Sequence[Path]) -> None:

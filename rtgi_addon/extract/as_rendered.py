@@ -14,6 +14,8 @@ from typing import TypeVar
 
 import bpy
 
+from ..scenes import remove_scene
+
 R = TypeVar("R")
 
 ENGINE = "RTGI_EXTRACT"
@@ -69,7 +71,7 @@ def _copy_to_render(scene: bpy.types.Scene, view_layer: bpy.types.ViewLayer) -> 
         render.use_motion_blur = render.use_border = render.use_persistent_data = False
         yield copy
     finally:
-        bpy.data.scenes.remove(copy)
+        remove_scene(copy)
         bpy.data.objects.remove(camera)
         bpy.data.cameras.remove(data)
 

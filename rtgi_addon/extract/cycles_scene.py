@@ -11,6 +11,8 @@ from contextlib import contextmanager
 
 import bpy
 
+from ..scenes import remove_scene
+
 #: Kinds of data that a evaluation may leave behind.
 TEMPORARY = ("objects", "meshes", "cameras", "materials", "worlds", "images")
 
@@ -38,7 +40,7 @@ def cycles_scene(samples: int) -> Iterator[bpy.types.Scene]:
         settings.sample_clamp_direct = settings.sample_clamp_indirect = 0.0
         yield scene
     finally:
-        bpy.data.scenes.remove(scene)
+        remove_scene(scene)
 
 
 @contextmanager
