@@ -121,5 +121,5 @@ def _summary(plan: Plan, records: list[dict[str, Any]], seconds: float) -> BakeS
         kept=sum(record["kept"] for record in records),
         seconds=seconds,
         estimated_error=max(errors, default=None),
-        warnings=plan.warnings,
+        warnings=tuple(dict.fromkeys((*plan.warnings, *(text for r in records for text in r["warnings"])))),
     )

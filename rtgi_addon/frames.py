@@ -84,13 +84,17 @@ def open_folder(plan: Plan) -> BakeFolder:
 
 def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict[str, Any]]:
     """Bake and write all frames of ``plan``; their records as in bake.json, each with ``kept``."""
-    records = []
+    records, said = [], set(plan.warnings)
     with ExitStack() as stack:
         session = _once(lambda: stack.enter_context(_session(plan, listener)))
         for index, frame in enumerate(plan.frames):
             listener.frame_begins(frame, index, len(plan.frames))
             records.append(_frame(plan, folder, session, index))
             listener.frame_done(frame, records[-1])
+            for text in records[-1]["warnings"]:
+                if text not in said:  # what holds for every frame is said once
+                    listener.warn(text)
+                    said.add(text)
         if plan.job.texels:
             listener.report("texels", 0, 1)
             write_arrays(plan.out / "texels.npz", texel_arrays(plan, session().texels))

@@ -152,6 +152,23 @@ def test_the_same_command_gives_the_same_bytes_on_any_number_of_threads(scene_fi
     assert texels[0] == texels[1] == texels[2]
 
 
+def test_without_a_denoiser_the_bake_goes_on_and_says_so_once(
+    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As in Debian's Blender, which is built without Open Image Denoise."""
+    plain, bare = tmp_path / "plain", tmp_path / "bare"
+    assert bake_to(plain, scene_file, "--no-denoise") == 0
+    monkeypatch.setattr("rtgi_addon.frames.library_folders", lambda: [tmp_path])
+    capfd.readouterr()
+    assert bake_to(bare, scene_file) == 0
+    said = [line for line in capfd.readouterr().err.splitlines() if line.startswith("warning: ")]
+    assert len(said) == 1 and "Open Image Denoise" in said[0] and "not denoised" in said[0]
+    assert maps_of(bare) == maps_of(plain)
+    assert bake_to(bare, scene_file, "--resume", "--json") == 0
+    done = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert done["kept"] == len(FRAMES) and done["warnings"] == [said[0].removeprefix("warning: ")]
+
+
 def test_another_seed_gives_other_noise(scene_file: Path, tmp_path: Path) -> None:
     assert bake_to(tmp_path / "a", scene_file, "--seed", "0", "--frames", "1") == 0
     assert bake_to(tmp_path / "b", scene_file, "--seed", "1", "--frames", "1") == 0
