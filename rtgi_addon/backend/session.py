@@ -19,7 +19,7 @@ from .final_gather.bright import bright_targets
 from .final_gather.gather import GatherRays
 from .final_gather.links import Links, trace_links
 from .final_gather.radiosity import Illumination
-from .finish.finisher import Finisher, fill
+from .finish.finisher import Finisher, OidnOpening, fill
 from .lamps import emission
 from .lamps.direct import direct_irradiance, make_shadows
 from .lamps.sky import Sky, make_sky
@@ -98,13 +98,14 @@ class Session:
         state, _ = bounded_state(state, scene)
         self.scene, self.atlas, self.settings = scene, atlas, settings
         self._report = report
+        oidn = OidnOpening(settings, oidn_paths)
         self._workers = Workers(settings.threads)
         self.geometry = Geometry(scene, state)
         self._tracer = EmbreeTracer(scene, self.geometry, state, self._workers)
         self.texels = make_texels(scene, atlas, self.geometry)
         self._bounds = emission.make_bounds(self.geometry)
         self._sides = sending_sides(scene, atlas)
-        self._finisher = Finisher(scene, atlas, self.texels, settings, oidn_paths)
+        self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
 
     def close(self) -> None:
         """Give threads and the denoiser back."""

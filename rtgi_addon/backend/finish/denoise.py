@@ -46,7 +46,7 @@ class MapDenoiser:
         self._denoiser = denoiser
         self._index = index
         self._surface = surface
-        self._see(np.ones(len(surface), np.bool_))
+        self._seen: Bool | None = None  # the valid texels that the pages are laid out for
 
     def denoise(self, values: Float32, *, valid: Bool | None = None) -> Float32:
         """``values`` (n, 3) >= 0 without their noise; each surface keeps its mean (within ``MOST_GAIN``).
@@ -57,13 +57,13 @@ class MapDenoiser:
         if values.shape != (len(self._surface), 3):
             raise ValueError(f"values of shape {values.shape}: must be ({len(self._surface)}, 3)")
         seen = np.ones(len(values), np.bool_) if valid is None else valid
-        if not np.array_equal(seen, self._seen):
+        if self._seen is None or not np.array_equal(seen, self._seen):
             self._see(seen)
         require_finite(values[seen])
         if (values[seen] < 0).any():
             raise ValueError(f"{np.count_nonzero((values[seen] < 0).any(axis=1))} texels are negative")
         known = np.where(seen[:, None], values, np.float32(0))
-        mean = self._means(known)
+        mean = self._means(known, seen)
         relative = self._relative_to(mean, known)
         shown = np.concatenate([relative, np.ones((1, 3), np.float32)])
         filtered = np.zeros_like(relative)
@@ -71,7 +71,7 @@ class MapDenoiser:
             image = self._denoiser.denoise(shown[crop.source], input_scale=INPUT_SCALE)
             filtered[crop.texels] = image.reshape(-1, 3)[crop.pixels]
         # The mean of ``relative`` is 1.
-        gain = 1 / np.maximum(self._means(filtered), 1 / MOST_GAIN)
+        gain = 1 / np.maximum(self._means(filtered, seen), 1 / MOST_GAIN)
         return filtered * (gain * mean).astype(np.float32)[self._surface]
 
     def _see(self, seen: Bool) -> None:
@@ -80,9 +80,9 @@ class MapDenoiser:
         self._count = np.maximum(np.bincount(self._surface, weights=seen), 1)
         self._crops = [_make_crop(page, self._surface, seen) for page in self._index if (page >= 0).any()]
 
-    def _means(self, values: Float32) -> Float64:
+    def _means(self, values: Float32, seen: Bool) -> Float64:
         """(surfaces, 3) mean over the valid texels of each surface."""
-        sums = [np.bincount(self._surface, weights=np.where(self._seen, channel, 0)) for channel in values.T]
+        sums = [np.bincount(self._surface, weights=np.where(seen, channel, 0)) for channel in values.T]
         return np.asarray(np.stack(sums, axis=1) / self._count[:, None], np.float64)
 
     def _relative_to(self, mean: Float64, values: Float32) -> Float32:

@@ -7,6 +7,7 @@ The last stages of a frame; what they need of the atlas is made once per session
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +21,41 @@ from .oidn import Denoiser, OidnError, find_oidn
 from .seams import SeamMatcher
 
 
+class OidnOpening:
+    """Open Image Denoise being opened beside other work: loading it takes as long as rasterising a small atlas."""
+
+    def __init__(self, settings: BakeSettings, paths: Sequence[Path]) -> None:
+        self._thread = ThreadPoolExecutor(1)
+        self._opened = self._thread.submit(_open_oidn, settings, paths)
+
+    def result(self) -> tuple[Denoiser | None, str | None]:
+        """The denoiser, or why there is none where one was asked for."""
+        opened = self._opened.result()
+        self._thread.shutdown()
+        return opened
+
+
+def _open_oidn(settings: BakeSettings, paths: Sequence[Path]) -> tuple[Denoiser | None, str | None]:
+    if not settings.denoise:
+        return None, None
+    library = find_oidn(paths)
+    if library is None:
+        return None, "Open Image Denoise was not found: maps are not denoised; use --quality final"
+    try:
+        return Denoiser(library, threads=settings.threads), None
+    except OidnError as fault:
+        return None, f"{fault}: maps are not denoised; use --quality final"
+
+
 class Finisher:
     """The last stages of one atlas. Holds the denoiser, which :meth:`close` gives back."""
 
-    def __init__(
-        self, scene: Scene, atlas: Atlas, texels: Texels, settings: BakeSettings, oidn_paths: Sequence[Path]
-    ) -> None:
+    def __init__(self, scene: Scene, atlas: Atlas, texels: Texels, settings: BakeSettings, oidn: OidnOpening) -> None:
         self._texels = texels
         self._dilation = DilationMap(texels.index)
         self._seams = SeamMatcher(scene, atlas, self._dilation, texels.surface) if settings.seams else None
-        self.warnings: list[str] = []
-        self._oidn = self._open_oidn(settings, oidn_paths)
+        self._oidn, warning = oidn.result()
+        self.warnings = [] if warning is None else [warning]
         self._denoiser = MapDenoiser(self._oidn, texels.index, texels.surface) if self._oidn else None
 
     def close(self) -> None:
@@ -40,25 +65,12 @@ class Finisher:
             self._oidn = None
             self._denoiser = None
 
-    def _open_oidn(self, settings: BakeSettings, paths: Sequence[Path]) -> Denoiser | None:
-        if not settings.denoise or not self._texels.count:
-            return None
-        library = find_oidn(paths)
-        if library is None:
-            self.warnings.append("Open Image Denoise was not found: maps are not denoised; use --quality final")
-            return None
-        try:
-            return Denoiser(library, threads=settings.threads)
-        except OidnError as fault:
-            self.warnings.append(f"{fault}: maps are not denoised; use --quality final")
-            return None
-
     def denoise(self, values: Float32, stand_in: Int32) -> Float32:
         """``values`` (n, 3) filtered; texels that are not valid get what the filter makes of their surroundings.
 
         Where there is no denoiser they are only filled.
         """
-        if self._denoiser is None:
+        if self._denoiser is None or not len(values):
             return fill(values, stand_in)
         valid = stand_in == np.arange(len(stand_in))
         return self._denoiser.denoise(np.maximum(values, 0), valid=valid)

@@ -104,16 +104,18 @@ def scatter(
     facing = np.where(hits.back, np.float32(-1), np.float32(1))[:, None]
     normal = surfaces.normals.take(hits.triangle, axis=0) * facing
     reflected = surfaces.albedo.take(texel, axis=0, mode="clip")
-    reflected *= (texel >= 0)[:, None] if diffuse else np.float32(0)
+    reflected *= (texel >= 0)[:, None]
     special = np.zeros(0, np.int64)
     if surfaces.passes.any():
         special = np.nonzero(surfaces.passes[surfaces.material_of_triangle.take(hits.triangle)])[0]
-    kind, after = choose([reflected], flux, numbers[2])
+    carried = np.float32(diffuse)
+    kind, after = choose([reflected * carried], flux, numbers[2])
     kind[kind == 1] = ABSORBED
     out = np.zeros_like(direction)
     if len(special):
         sub = take_hits(hits, special)
         shares, turned = _special_lobes(surfaces, sub, normal[special], direction[special], reflected[special])
+        shares[0] = shares[0] * carried
         kind[special], after[special] = choose(shares, flux[special], numbers[2][special])
         for lobe, vectors in turned.items():
             rows = np.nonzero(kind[special] == lobe)[0]

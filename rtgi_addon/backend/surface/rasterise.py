@@ -256,11 +256,14 @@ def _points(
 ) -> tuple[Int32, Float32]:
     """((n, POINTS), (n, POINTS, 2)) triangle and weights of points over the covered sub-samples, repeated where there
     are fewer; the texel's own ``triangle``, ``barycentric`` where there are none."""
-    spread = owner[:, _SPREAD]
-    covered_first = np.argsort(spread < 0, axis=1, kind="stable")
-    count = (spread >= 0).sum(axis=1)
-    turn = np.arange(POINTS)[None, :] % np.maximum(count, 1)[:, None]
-    sub = _SPREAD[np.take_along_axis(covered_first, turn, axis=1)]  # (n, POINTS)
+    sub = np.broadcast_to(_SPREAD[:POINTS], (len(owner), POINTS)).copy()
+    part = np.nonzero((owner < 0).any(axis=1))[0]
+    if len(part):
+        spread = owner[part][:, _SPREAD]
+        covered_first = np.argsort(spread < 0, axis=1, kind="stable")
+        count = (spread >= 0).sum(axis=1)
+        turn = np.arange(POINTS)[None, :] % np.maximum(count, 1)[:, None]
+        sub[part] = _SPREAD[np.take_along_axis(covered_first, turn, axis=1)]
     found = np.take_along_axis(owner, sub, axis=1)
     some = found >= 0
     found = np.where(some, found, triangle[:, None])
