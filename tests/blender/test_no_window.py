@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Commands in a context without a window, as in ``blender -b FILE --command rtgi``, where Blender 4.2 crashes easily."""
+"""Commands in a context without a window, as in ``blender -b FILE --command rtgi``: Blender 4.2 may crash there."""
 
 from __future__ import annotations
 
