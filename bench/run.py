@@ -30,7 +30,7 @@ def bench_scene(scene: BenchScene, *, full: bool = False) -> tuple[list[Run], Ma
             for connection, methods in ((ours, OURS), (other, cycles)):
                 for method in methods:
                     if seed < method.seeds:
-                        connection.send((method.setting, seed))
+                        connection.send((method, seed))
                         runs += _logged(scene, _answer(connection))
         return runs, machine
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 
-from rtgi_addon.backend.settings import Quality
+from rtgi_addon.backend.settings import SAMPLES_OF_QUALITY, Quality, SampleCounts
 
 ROOT = Path(__file__).parents[1]
 #: Errors at which times are compared.
@@ -47,14 +47,15 @@ class Curve(StrEnum):
 
 @dataclass(frozen=True)
 class Method:
-    """One point of a curve; ``setting`` is a quality of RTGI or Cycles' samples per texel."""
+    """One point of a curve; ``samples`` of RTGI, or Cycles' per texel."""
 
-    setting: Quality | int
+    samples: SampleCounts | int
     seeds: int
+    name: str = ""
 
     @property
     def label(self) -> str:
-        return f"{self.setting} spp" if isinstance(self.setting, int) else str(self.setting)
+        return self.name or f"{self.samples} spp"
 
 
 SCENES = (
@@ -62,7 +63,15 @@ SCENES = (
     BenchScene("larsen_box", "Box with a bumpy floor (Larsen04, Figure 1)"),
     BenchScene("two_rooms", "Two rooms, the wall between them closed (Larsen04, Figure 5)"),
 )
-OURS = (Method(Quality.DRAFT, 5), Method(Quality.PREVIEW, 5), Method(Quality.FINAL, 5))
+OURS = tuple(
+    Method(counts, 5, name)
+    for counts, name in (
+        (SAMPLES_OF_QUALITY[Quality.DRAFT], "draft"),
+        (SampleCounts(16, 16), "16 + 16 rays"),
+        (SAMPLES_OF_QUALITY[Quality.PREVIEW], "preview"),
+        (SAMPLES_OF_QUALITY[Quality.FINAL], "final"),
+    )
+)
 CYCLES = (Method(16, 5), Method(64, 5), Method(256, 5), Method(1024, 3))
 #: With --full, so that Cycles' curves reach the lower errors.
 CYCLES_FULL = (*CYCLES, Method(4096, 2))

@@ -15,7 +15,7 @@ from rtgi_addon.backend.finish.denoise import MapDenoiser
 from rtgi_addon.backend.finish.oidn import Denoiser, find_oidn
 from rtgi_addon.backend.scene import Bool, Float32, Int32
 from rtgi_addon.backend.session import FrameResult, Session
-from rtgi_addon.backend.settings import BakeSettings, Quality
+from rtgi_addon.backend.settings import BakeSettings, SampleCounts
 from rtgi_addon.backend.surface.texels import Texels
 from rtgi_addon.environment import device, library_folders, versions
 
@@ -25,7 +25,7 @@ from .measure import Cost, Meter
 from .prepare import Prepared, prepare, texel_table
 from .reference import Reference, load_reference, match
 from .results import Run
-from .table import LEAST_WHOLE, BenchScene, Curve
+from .table import LEAST_WHOLE, OURS, BenchScene, Curve, Method
 
 
 @dataclass(frozen=True)
@@ -60,29 +60,40 @@ def _hello(subject: Subject) -> dict[str, Any]:
 
 def serve_ours(connection: Connection, scene: BenchScene) -> None:
     subject, meter = make_subject(scene), Meter()
-    _bake(subject, meter, Quality.DRAFT, seed=99, denoise=True)  # libraries are loaded and warm, as Cycles' are
+    _bake(subject, meter, OURS[0].samples, seed=99, denoise=True)  # libraries are loaded and warm, as Cycles' are
     connection.send(_hello(subject))
-    _serve(connection, lambda quality, seed: _run_ours(subject, meter, quality, seed))
+    _serve(connection, lambda method, seed: _run_ours(subject, meter, method, seed))
 
 
-def _run_ours(subject: Subject, meter: Meter, quality: Quality, seed: int) -> list[Run]:
+def _run_ours(subject: Subject, meter: Meter, method: Method, seed: int) -> list[Run]:
     runs = []
     for curve, denoise in ((Curve.OURS, False), (Curve.OURS_DENOISED, True)):
-        result, cost = _bake(subject, meter, quality, seed=seed, denoise=denoise)
+        result, cost = _bake(subject, meter, method.samples, seed=seed, denoise=denoise)
         if result.stats.warnings:
             raise RuntimeError("; ".join(result.stats.warnings))
         maps = result.maps
         page = maps.iim if maps.caustics is None else maps.iim + maps.caustics
         t = subject.texels
         errors = subject.errors(page[t.page, t.row, t.col])
-        runs.append(Run(curve, str(quality), seed, cost, errors, result.stats.estimated_error))
+        runs.append(Run(curve, method.label, seed, cost, errors, result.stats.estimated_error))
     return runs
 
 
-def _bake(subject: Subject, meter: Meter, quality: Quality, *, seed: int, denoise: bool) -> tuple[FrameResult, Cost]:
+def _settings(counts: SampleCounts, **options: Any) -> BakeSettings:
+    """Settings with sample counts that may have no name."""
+
+    class Counted(BakeSettings):
+        samples = property(lambda self: counts)
+
+    return Counted(**options)
+
+
+def _bake(
+    subject: Subject, meter: Meter, samples: SampleCounts, *, seed: int, denoise: bool
+) -> tuple[FrameResult, Cost]:
     """All that a bake does after extraction, from a new session to its maps."""
     p = subject.prepared
-    settings = BakeSettings(quality=quality, seed=seed, denoise=denoise, resolution=p.atlas.resolution)
+    settings = _settings(samples, seed=seed, denoise=denoise, resolution=p.atlas.resolution)
 
     def work() -> FrameResult:
         with Session(p.scene, p.atlas, settings, p.first, oidn_paths=library_folders()) as session:
@@ -102,21 +113,20 @@ def serve_cycles(connection: Connection, scene: BenchScene) -> None:
         denoiser = MapDenoiser(oidn, subject.texels.index, subject.texels.surface)
         denoiser.denoise(baker.run(4, 99)[0])
         connection.send(_hello(subject))
-        _serve(connection, lambda samples, seed: _run_cycles(subject, meter, baker, denoiser, samples, seed))
+        _serve(connection, lambda method, seed: _run_cycles(subject, meter, baker, denoiser, method, seed))
 
 
 def _run_cycles(
-    subject: Subject, meter: Meter, baker: CyclesBake, denoiser: MapDenoiser, samples: int, seed: int
+    subject: Subject, meter: Meter, baker: CyclesBake, denoiser: MapDenoiser, method: Method, seed: int
 ) -> list[Run]:
-    values, cost = baker.run(samples, seed)
+    values, cost = baker.run(method.samples, seed)
     # What Cycles left black lies under geometry, or on a border; the filter is not shown it, as it is not RTGI's.
     filtered, extra = meter.measured(lambda: denoiser.denoise(values, valid=values.any(axis=1)))
     peaks = [c.peak_bytes for c in (cost, extra) if c.peak_bytes is not None]
     both = Cost(cost.seconds + extra.seconds, max(peaks, default=None))
-    label = f"{samples} spp"
     return [
-        Run(Curve.CYCLES, label, seed, cost, subject.errors(values)),
-        Run(Curve.CYCLES_DENOISED, label, seed, both, subject.errors(filtered)),
+        Run(Curve.CYCLES, method.label, seed, cost, subject.errors(values)),
+        Run(Curve.CYCLES_DENOISED, method.label, seed, both, subject.errors(filtered)),
     ]
 
 

@@ -94,10 +94,13 @@ def add_window(white: bpy.types.Material, black: bpy.types.Material) -> None:
     faces = [(a + i, a + (i + 1) % 4, b + (i + 1) % 4, b + i) for a, b in ((0, 4), (4, 8)) for i in range(4)]
     add_mesh("Window wall", np.concatenate(rings), faces, white)
     x, w = -REVEAL + 0.04, 0.05
-    bars = [((x, y, z0), (x + w, y + w, z1)) for y in (y0, (y0 + y1 - w) / 2, y1 - w)]
-    bars += [((x, y0, z), (x + w, y1, z + w)) for z in (z0, z1 - w - 0.42, z1 - w)]
+    # No two faces in one plane: Cycles lets them shadow one another. Everything goes a little into what it touches.
+    a, b = 0.004, 0.003
+    bars = [((x, y - a, z0 - a), (x + w, y + w + a, z1 + a)) for y in (y0, (y0 + y1 - w) / 2, y1 - w)]
+    bars += [((x + b, y0 - b, z - b), (x + w - b, y1 + b, z + w + b)) for z in (z0, z1 - w - 0.42, z1 - w)]
     add_boxes("Window frame", bars, white)
-    soften(add_boxes("Window sill", [((-0.12, y0 - 0.06, z0 - 0.03), (0.08, y1 + 0.06, z0))], white), 0.008, 2)
+    sill = ((-0.12, y0 - 0.06, z0 - 0.03), (0.08, y1 + 0.06, z0 + a))
+    soften(add_boxes("Window sill", [sill], white), 0.008, 2)
     linen = paint("Linen", (0.68, 0.63, 0.55))
     for name, a, b in (("Curtain left", 0.42, 0.98), ("Curtain right", 3.32, 3.88)):
         place(add_curtain(name, a, b, linen), (0.11, 0, 0))
