@@ -85,12 +85,13 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
         folder = open_folder(plan)
         with failing(folder):
             records = bake_frames(plan, folder, listener)
-            if job.save_blend is not None:
-                report("save", 0, 1)
-                for text in save_lit_copy(job.save_blend, source, layouts, plan):
-                    listener.warn(text)
-                report("save", 1, 1)
-            folder.close("done")
+    with failing(folder):  # a copy opens at the frame where its author was
+        if job.save_blend is not None:
+            report("save", 0, 1)
+            for text in save_lit_copy(job.save_blend, source, layouts, plan):
+                listener.warn(text)
+            report("save", 1, 1)
+        folder.close("done")
     return _summary(plan, records, time.perf_counter() - start)
 
 

@@ -365,6 +365,7 @@ def test_a_saved_copy_shows_the_maps_and_bakes_to_the_same_ones(scene_file: Path
     assert not any(group.get("rtgi") for group in bpy.data.node_groups)  # the open scene stays unlit
     assert [path.name for path in lit.parent.iterdir()] == ["lit.blend"]
     bpy.ops.wm.open_mainfile(filepath=str(lit))
+    assert bpy.context.scene.frame_current == 2  # as in the scene, not the last one baked
     paths = [Path(bpy.path.abspath(image.filepath)).resolve() for image in bpy.data.images if image.get("rtgi")]
     assert paths == [tmp_path / "out" / map_name("iim", 0, 1)]
     assert "RTGI" in bpy.data.objects["Floor"].data.uv_layers
