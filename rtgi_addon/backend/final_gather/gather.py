@@ -81,7 +81,8 @@ class GatherRays:
     def trace(self, first: int, stop: int) -> TracedLinks:
         """The links of texels first..stop-1."""
         rows = slice(first, stop)
-        pattern = pattern_of_texels(first, stop, self._seed)
+        t = self._texels
+        pattern = pattern_of_texels(t.page[rows], t.row[rows], t.col[rows], self._seed)
         fan, hits = self._cosine(rows, pattern)
         opened, tested = self._open_points(rows, fan)
         from_open = np.take_along_axis(opened, fan.start, axis=1)

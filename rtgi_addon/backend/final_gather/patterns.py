@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Tables of gather-ray patterns. Each texel takes one by its number, so no ray needs random numbers of its own.
+"""Tables of gather-ray patterns. Each texel takes one by its place on the page, so no ray needs numbers of its own.
 
-PATTERNS digit-scrambled copies of one low-discrepancy set: within a texel the rays are well spread, and two texels
-rarely share a pattern, so what error is left looks like noise, which the denoiser removes best.
+Within a texel the rays are a digit-scrambled low-discrepancy set. The TILE × TILE texels of a tile take consecutive
+parts of one such set: together they are as well spread as one texel with TILE² times the rays, so that what the
+denoiser averages cancels. Tiles are scrambled each in its own way.
 """
 
 from __future__ import annotations
@@ -12,11 +13,15 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..sampling import UInt32, hash_keys, sample_cosine_hemisphere, stratified_pair, unit_float32
+from ..sampling import hash_keys, sample_cosine_hemisphere, stratified_pair, unit_float32
 from ..scene import Float32, Int32
 from ..surface.rasterise import POINTS
 
-PATTERNS = 1024
+#: Texels along a tile; a power of two.
+TILE = 4
+#: Scrambled sets; two tiles that look alike are rarely near.
+SETS = 64
+PATTERNS = SETS * TILE * TILE
 
 
 @dataclass(frozen=True)
@@ -38,27 +43,35 @@ class BrightPatterns:
 
 @lru_cache(maxsize=8)
 def cosine_patterns(count: int, seed: int) -> CosinePatterns:
-    keys = np.arange(PATTERNS, dtype=np.uint32)
-    u, v = (unit_float32(x).reshape(-1) for x in stratified_pair(keys, count, pair=0, seed=seed))
+    u, v = (x.reshape(-1) for x in _pair(count, 0, seed))
     directions = sample_cosine_hemisphere(u, v).astype(np.float32).reshape(PATTERNS, count, 3)
-    return CosinePatterns(directions, _starts(keys, count, 1, seed))
+    return CosinePatterns(directions, _starts(count, 1, seed))
 
 
 @lru_cache(maxsize=8)
 def bright_patterns(count: int, seed: int) -> BrightPatterns:
-    keys = np.arange(PATTERNS, dtype=np.uint32)
     # A (0, 2)-sequence: the first half of the samples is stratified by itself, and so is the second.
-    choice = unit_float32(stratified_pair(keys, count, pair=4, seed=seed)[0])
-    on_target = np.stack([unit_float32(x) for x in stratified_pair(keys, count, pair=2, seed=seed)], axis=-1)
-    return BrightPatterns(choice, on_target.astype(np.float32), _starts(keys, count, 3, seed))
+    choice, _ = _pair(count, 4, seed)
+    on_target = np.stack(_pair(count, 2, seed), axis=-1)
+    return BrightPatterns(choice, on_target, _starts(count, 3, seed))
 
 
-def _starts(keys: UInt32, count: int, pair: int, seed: int) -> Int32:
+def _pair(count: int, pair: int, seed: int) -> tuple[Float32, Float32]:
+    """(P, count), (P, count) points of the square: each set's sequence cut into the parts of its tile's texels."""
+    keys = np.arange(SETS, dtype=np.uint32)
+    x, y = stratified_pair(keys, TILE * TILE * count, pair=pair, seed=seed)
+    return unit_float32(x).reshape(PATTERNS, count), unit_float32(y).reshape(PATTERNS, count)
+
+
+def _starts(count: int, pair: int, seed: int) -> Int32:
     """(P, count) points 0..POINTS-1, each as often as the others, in an order of its own for each pattern."""
-    spread = unit_float32(stratified_pair(keys, count, pair=pair, seed=seed)[0])
-    return (spread * POINTS).astype(np.int32)
+    return np.asarray(_pair(count, pair, seed)[0] * POINTS, np.int32)
 
 
-def pattern_of_texels(first: int, stop: int, seed: int) -> Int32:
-    """(stop - first,) the pattern of each texel numbered ``first`` .. ``stop`` - 1."""
-    return (hash_keys(np.arange(first, stop), 11, seed) % np.uint32(PATTERNS)).astype(np.int32)
+def pattern_of_texels(page: Int32, row: Int32, col: Int32, seed: int) -> Int32:
+    """(m,) the pattern of texels at ``page``, ``row``, ``col`` (m,)."""
+    tile = hash_keys(page, row // TILE, col // TILE, seed) % np.uint32(SETS)
+    # Neighbours in pairs, pairs of pairs: every 2 × 2 block of a tile is a part of its own.
+    r, c = row % TILE, col % TILE
+    within = (r & 1) | (c & 1) << 1 | (r & 2) << 1 | (c & 2) << 2
+    return np.asarray(tile.astype(np.int32) * (TILE * TILE) + within, np.int32)
