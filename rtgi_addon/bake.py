@@ -105,7 +105,8 @@ def _checked(job: BakeJob) -> tuple[Sequence[int], Path]:
         problems += fault.problems
     if job.save_blend is not None and len({b - a for a, b in pairwise(frames)}) > 1:
         problems.append(f"{job.save_blend}: image sequences need evenly spaced frames; choose such, or do not save it")
-    needed = map_bytes(frames=len(frames), resolution=job.settings.resolution, pages=1, kinds=2)
+    # A resumed bake may have most of its maps already.
+    needed = 0 if job.resume else map_bytes(frames=len(frames), resolution=job.settings.resolution, pages=1, kinds=2)
     problems += [] if out is None else folder_problems(out, needed)
     if job.save_blend is not None:
         problems += folder_problems(job.save_blend.parent)
