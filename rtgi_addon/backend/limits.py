@@ -19,6 +19,8 @@ from .scene import BLACK, Float32, FrameState, Light, Material, Mesh, Scene, Wor
 #: light, and no single reflection changes by more than 0.1 %.
 MOST_ALBEDO = 0.999
 DEFAULT_IOR = 1.45
+#: The brightest light, W or W/(m² sr): the sun's surface has 2e7. Squares and sums of it stay within float32.
+MOST_LIGHT = 1e15
 
 Warn = Callable[[str], None]
 RGB = tuple[float, float, float]
@@ -98,10 +100,17 @@ def _least(albedo: RGB) -> RGB:
 
 
 def _radiance(values: RGB, name: str, warn: Warn) -> RGB:
-    bounded = np.maximum(_finite(values), 0)
-    if not np.array_equal(bounded, values):
+    bounded = _bounded_light(np.asarray(values), name, warn)
+    return values if np.array_equal(bounded, values) else _rgb(bounded)
+
+
+def _bounded_light(values: Float32, name: str, warn: Warn) -> Float32:
+    finite = _finite(values)
+    if not np.array_equal(np.maximum(finite, 0), values):
         warn(f"{name}: light that is negative or not finite counts as zero")
-    return _rgb(bounded)
+    if finite.max(initial=0) > MOST_LIGHT:
+        warn(f"{name}: light above {MOST_LIGHT:g} counts as that much")
+    return np.clip(finite, 0, MOST_LIGHT)
 
 
 def _light(light: Light, warn: Warn) -> Light:
@@ -115,11 +124,8 @@ def _light(light: Light, warn: Warn) -> Light:
 
 
 def _world(world: World, warn: Warn) -> World:
-    bounded = np.maximum(_finite(world.radiance), 0)
-    if np.array_equal(bounded, world.radiance):
-        return world
-    warn("world: radiance that is negative or not finite counts as zero")
-    return World(bounded.astype(np.float32))
+    bounded = _bounded_light(world.radiance, "world", warn)
+    return world if np.array_equal(bounded, world.radiance) else World(bounded.astype(np.float32))
 
 
 def _mesh(mesh: Mesh, warn: Warn) -> Mesh:
@@ -140,7 +146,7 @@ def _mesh(mesh: Mesh, warn: Warn) -> Mesh:
         corner_normals=_finite(mesh.corner_normals),
         corner_uv=_finite(mesh.corner_uv),
         albedo_map=None if mesh.albedo_map is None else _albedo_map(mesh.albedo_map, mesh.name, warn),
-        emission_map=None if mesh.emission_map is None else np.maximum(_finite(mesh.emission_map), 0),
+        emission_map=None if mesh.emission_map is None else _bounded_light(mesh.emission_map, mesh.name, warn),
     )
     return bounded
 

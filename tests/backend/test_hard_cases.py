@@ -45,7 +45,7 @@ class Baked:
 
     def mean(self, instance: int, side: int = 0) -> float:
         """W/m² of all light on one side of an instance."""
-        return float(self.aim[(self.instance == instance) & (self.side == side)].mean())
+        return float(self.aim[(self.instance == instance) & (self.side == side) & self.valid].mean())
 
 
 def furnace(material: Material, texels: int = 6) -> tuple[Scene, Atlas]:
@@ -91,6 +91,25 @@ def test_emission_of_a_million_stays_in_proportion() -> None:
     dim, bright = (Baked(*furnace(Material("wall", (0.9,) * 3, (e, e, e)))) for e in (1.0, 1e6))
     np.testing.assert_allclose(bright.iim, 1e6 * dim.iim, rtol=1e-4)
     assert bright.warnings == []
+
+
+@pytest.mark.parametrize("bounced", [AimBounced.FEEDBACK, AimBounced.PHOTONS])
+def test_light_beyond_all_measure_is_bounded_and_told(bounced: AimBounced) -> None:
+    """What would overflow float32 does not, in lamps, materials, textures and skies."""
+    scene, atlas = scenes.cornell(4)
+    glow = replace(scene.materials[1], emission=(1e30, np.inf, 0.0))
+    shining = replace(scene.meshes[0], emission_map=np.full((2, 2, 3), 3e38, np.float32))
+    scene = Scene(
+        (shining, *scene.meshes[1:]),
+        scene.instances,
+        (scene.materials[0], glow, scene.materials[2]),
+        (replace(scene.lights[0], power=(1e300, 1e200, 0.0)),),
+        scenes.constant_sky(1e38),
+    )
+    baked = Baked(scene, atlas, replace(BARE, aim_bounced=bounced))
+    assert 0 < baked.aim.max() < 1e20
+    for name in ("lamp", "world", "floor", "material red"):
+        assert f"{name}: light above 1e+15 counts as that much" in baked.warnings
 
 
 @pytest.mark.parametrize("bounced", [AimBounced.FEEDBACK, AimBounced.PHOTONS])
@@ -177,7 +196,7 @@ def test_coplanar_and_interpenetrating_faces() -> None:
     over = scenes.quad("over", [(-2, -2, 0), (2, -2, 0), (2, 2, 0), (-2, 2, 0)])
     through = scenes.quad("through", [(2, 0.5, -1), (-2, 0.5, -1), (-2, 0.5, 2), (2, 0.5, 2)])
     alone, two = floor_and(through, lights=lamp), floor_and(through, over, lights=lamp)
-    plain, doubled = Baked(alone, placed(alone), FINE), Baked(two, placed(two), FINE)
+    plain, doubled = (Baked(s, placed(s, both=True), FINE) for s in (alone, two))
     assert doubled.mean(0) == pytest.approx(plain.mean(0), rel=0.03)
     assert doubled.mean(2) == pytest.approx(plain.mean(0), rel=0.03)
     assert doubled.mean(1) == pytest.approx(plain.mean(1), rel=0.05)
@@ -331,7 +350,7 @@ def test_a_sky_with_broken_pixels() -> None:
     radiance[0, 1] = -1
     baked = Baked(replace(clean, world=World(radiance)), placed(clean))
     np.testing.assert_allclose(baked.iim, np.pi, rtol=0.02)
-    assert baked.warnings == ["world: radiance that is negative or not finite counts as zero"]
+    assert baked.warnings == ["world: light that is negative or not finite counts as zero"]
 
 
 # --- mirrors and glass --------------------------------------------------------------------------------------------

@@ -149,7 +149,9 @@ def test_a_transform_that_is_not_finite(baked: Callable[..., Maps], add_plane: A
     lost = add_cube("Lost")
     lost.location.x = float("nan")
     add_lamp()
+    add_lamp((float("nan"), 0, 1)).name = "Lost lamp"
     maps = baked()
+    assert any("Lost lamp" in line for line in maps.said)
     assert maps.mean("Floor") > 0
     assert any("Lost" in line for line in maps.said)
     assert ("Lost", "front") not in maps.rectangle
@@ -253,6 +255,15 @@ def test_emission_of_a_million(baked: Callable[..., Maps], add_plane: AddObject)
     maps = baked()
     # No more arrives than leaves: π L A, from both sides.
     assert 0.1 * np.pi * 1e6 * 0.25 < maps.mean("Floor", "iim") * 16 < 2 * np.pi * 1e6 * 0.25
+
+
+def test_light_beyond_all_measure(baked: Callable[..., Maps], add_plane: AddObject) -> None:
+    add_plane("Floor", size=4, material=paint("Grey", colour=0.5))
+    add_plane("Glow", size=0.5, location=(0, 0, 1), material=paint("Glow", colour=1.0, glow=1e30))
+    add_lamp(power=1e37)
+    maps = baked()
+    for name in ("Glow", "Lamp"):
+        assert any(f"{name}: light above" in line for line in maps.said)
 
 
 def test_lamps_in_walls_on_surfaces_in_closed_boxes_and_black_ones(
