@@ -6,8 +6,10 @@ docs/robustness.md lists all such cases, these and those that other files test. 
 
 from __future__ import annotations
 
+import re
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -388,3 +390,11 @@ def test_an_index_of_refraction_of_nothing_is_told() -> None:
     pane = scenes.quad("pane", [(-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1)], material=1)
     scene = floor_and(pane, lights=(scenes.point_light((0, 0, 2)),), materials=(GREY, replace(GLASS, ior=0.0)))
     assert Baked(scene, placed(scene)).warnings == ["material glass: an index of refraction of 0.0 is taken as 1.45"]
+
+
+def test_the_table_of_cases_names_tests_that_exist() -> None:
+    root = Path(__file__).parents[2]
+    named = re.findall(r"`(\w+)/(\w+)::(\w+)`", (root / "docs" / "robustness.md").read_text())
+    assert len(named) > 60
+    for folder, file, test in named:
+        assert f"def test_{test}(" in (root / "tests" / folder / f"test_{file}.py").read_text(), (file, test)
