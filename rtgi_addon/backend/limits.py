@@ -36,10 +36,14 @@ def bounded_scene(scene: Scene) -> tuple[Scene, list[str]]:
 def bounded_state(state: FrameState, scene: Scene) -> tuple[FrameState, list[str]]:
     """The same for one frame. Raises BakeError where a transform is not finite."""
     lines: list[str] = []
-    lost = np.nonzero(~np.isfinite(state.matrix_world).all(axis=(1, 2)))[0]
-    if len(lost):
+    nowhere = np.nonzero(~np.isfinite(state.matrix_world).all(axis=(1, 2)))[0]
+    if len(nowhere):
         remedy = "clear it, or mend the driver or constraint that makes it"
-        raise BakeError(*(f"{scene.instances[i].name}: its transform is not finite; {remedy}" for i in lost))
+        raise BakeError(*(f"{scene.instances[i].name}: its transform is not finite; {remedy}" for i in nowhere))
+    for index, vertices in state.vertices.items():
+        if lost := int((~np.isfinite(vertices).all(axis=1)).sum()):
+            where = f"frame {state.frame}: {lost} of its vertices are not finite; they are put at its origin"
+            lines.append(f"{scene.meshes[index].name}: {where}")
     bounded = replace(
         state,
         lights=tuple(_light(light, lines.append) for light in state.lights),

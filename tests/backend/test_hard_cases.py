@@ -298,6 +298,33 @@ def test_200_000_triangles_in_time() -> None:
     assert seconds < 10  # takes about 2 on one core
 
 
+@pytest.mark.parametrize("bounced", [AimBounced.FEEDBACK, AimBounced.PHOTONS])
+def test_objects_that_fold_fly_off_vanish_and_break_between_frames(bounced: AimBounced) -> None:
+    """And in the end all is as at the start, to the bit."""
+    scene, atlas = scenes.cornell(6)
+    instances = tuple(replace(i, moving=True, deforming=i.name == "tall") for i in scene.instances)
+    scene, start, rng = replace(scene, instances=instances), scene.first_frame(0), np.random.default_rng(1)
+    settings = replace(BARE, resolution=atlas.resolution, aim_bounced=bounced)
+    with Session(scene, atlas, settings, start) as session:
+        first = session.advance(start).maps
+        for frame in range(1, 7):
+            matrices = start.matrix_world.copy()
+            matrices[frame % 7, :3, :3] *= rng.choice([0.0, -1.0, 1e-5, 1e4], 3)
+            matrices[(frame + 2) % 7, :3, 3] += rng.normal(size=3) * 10.0 ** rng.integers(-2, 6)
+            vertices = scene.meshes[6].vertices * rng.normal(size=3).astype(np.float32)
+            vertices[frame] = np.nan
+            state = replace(start, frame=frame, matrix_world=matrices, visible=rng.random(7) > 0.2)
+            result = session.advance(replace(state, vertices={6: vertices}))
+            assert np.isfinite(result.maps.aim).all() and (result.maps.aim >= 0).all()
+            assert result.stats.warnings == [
+                f"tall: frame {frame}: 1 of its vertices are not finite; they are put at its origin"
+            ]
+        whole = replace(start, vertices={6: scene.meshes[6].vertices})
+        last = session.advance(whole).maps
+    if bounced is AimBounced.FEEDBACK:  # photon bounds stay as large as they had to be
+        np.testing.assert_array_equal(last.aim, first.aim)
+
+
 # --- lamps --------------------------------------------------------------------------------------------------------
 
 
