@@ -19,9 +19,11 @@ def main() -> None:
     arguments = parser.parse_args()
     logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
     wanted = [s for s in SCENES if arguments.scene is None or s.name in arguments.scene]
-    runs = {scene: bench_scene(scene, full=arguments.full) for scene in wanted}
-    points = {scene: points_of(of_scene) for scene, (of_scene, _) in runs.items()}
-    write_report(points, {scene: machine for scene, (_, machine) in runs.items()}, ROOT / "docs")
+    points, machines = {}, {}
+    for scene in wanted:
+        runs, machines[scene] = bench_scene(scene, full=arguments.full)
+        points[scene] = points_of(runs)
+        write_report(points, machines, ROOT / "docs")  # anew after each scene: a run cut short is not lost
 
 
 if __name__ == "__main__":
