@@ -17,6 +17,7 @@ import numpy as np
 
 from .backend.errors import BakeError
 from .backend.scene import Atlas, FrameState, Placement
+from .eevee_light import restore_world
 from .extract.as_rendered import read_as_rendered
 from .extract.source_scene import frame_kept
 from .lightmap_nodes import make_group, remove_group
@@ -86,6 +87,7 @@ def _apply(
 
 def remove_lightmaps() -> None:
     """Take everything :func:`apply_lightmaps` added off the open file; the scene is as it was."""
+    restore_world(bpy.context.scene)
     unlight_materials()
     remove_standins()
     remove_group()

@@ -12,10 +12,12 @@ from pathlib import Path
 import bpy
 
 from .backend.errors import BakeError
+from .eevee_light import direct_light_only, kept
 from .job import Plan
 from .lightmap_nodes import MARK
 from .lightmaps import apply_lightmaps, map_files, remove_lightmaps
 from .output import whole_file
+from .preview import eevee_engine
 from .source import Layout, SourceScene
 
 
@@ -32,12 +34,16 @@ def take_off(named: Path | None) -> None:
 
 
 def save_lit_copy(path: Path, source: SourceScene, layouts: Sequence[Layout], plan: Plan) -> tuple[str, ...]:
-    """Save the copy at ``path``; warnings of what it does not show. Paths in it are relative to it."""
+    """Save the copy at ``path``; warnings of what it does not show. Paths in it are relative to it.
+
+    It opens in Eevee, the engine that the maps are made for, without the light that they hold.
+    """
+    scene = bpy.context.scene
     maps = map_files(plan.out, page_count=plan.atlas.page_count, frames=plan.frames)
     applied = apply_lightmaps(source, layouts, plan.atlas, maps, plan.states)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole_file(path) as part:
+        with direct_light_only(scene), kept(scene.render, engine=eevee_engine()), whole_file(path) as part:
             bpy.ops.wm.save_as_mainfile(filepath=str(part), copy=True, check_existing=False)
     except RuntimeError as fault:
         reason = str(fault).strip().splitlines()[0].removeprefix("Error: ")
