@@ -22,6 +22,8 @@ from .gather import NO_TARGET, GatherRays, TracedLinks
 #: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
 #: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
 LEAST_FREE_SHARE = 0.9
+#: A half's rows are scaled up from the whole's by this at most; 2 is expected.
+MOST_HALF_SCALE = 4.0
 
 
 @dataclass(frozen=True)
@@ -109,10 +111,12 @@ def _packed(traced: TracedLinks, samples: SampleCounts) -> _Packed:
     weight = traced.weight * traced.usable
     scale = _row_scale(weight)
     first = _first_half(weight.shape[1], samples)
+    # Half of few rays may have hardly any weight; its own scale would then give nearly all to one bright target.
+    half_scale = np.minimum(_row_scale(weight[:, first]), scale * np.float32(MOST_HALF_SCALE))
     beyond_scale = scale[traced.beyond_row - traced.first][:, None]
     return _Packed(
         whole=_rows(traced.target, weight, scale),
-        half=_rows(traced.target[:, first], weight[:, first], _row_scale(weight[:, first])),
+        half=_rows(traced.target[:, first], weight[:, first], half_scale),
         beyond=(traced.beyond_row, traced.beyond_target, traced.beyond_weight * beyond_scale),
         valid=traced.free >= LEAST_FREE_SHARE,
         rays=traced.rays,
