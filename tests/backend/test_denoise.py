@@ -154,6 +154,19 @@ def test_noise_goes_and_structure_stays(denoiser):
     assert np.sqrt(np.mean((result - truth)[edge] ** 2)) < 1.7 * np.sqrt(np.mean((result - truth) ** 2))
 
 
+def test_the_fast_network_is_nearly_as_good(denoiser):
+    index, surface = layout((8, 8, 64, 64))
+    row, _ = np.nonzero(index[0] >= 0)
+    truth = np.repeat((1 + np.sin(row / 20))[:, None], 3, axis=1).astype(np.float32)
+    noisy = truth * noise(len(surface))
+    errors = {}
+    with Denoiser(denoiser.library, fast=True) as fast:
+        for name, engine in (("full", denoiser), ("fast", fast)):
+            errors[name] = np.sqrt(np.mean((MapDenoiser(engine, index, surface).denoise(noisy) - truth) ** 2))
+    assert errors["fast"] != errors["full"]  # another network
+    assert errors["fast"] < 1.5 * errors["full"] < 0.3 * np.sqrt(np.mean((noisy - truth) ** 2))
+
+
 @needs_oidn
 @settings(max_examples=12, deadline=None)
 @given(

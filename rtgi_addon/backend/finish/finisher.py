@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from ..scene import Atlas, Bool, Float32, Int32, Scene
-from ..settings import BakeSettings
+from ..settings import BakeSettings, Quality
 from ..surface.texels import Texels
 from .denoise import MapDenoiser
 from .dilate import DilationMap
@@ -42,7 +42,9 @@ def _open_oidn(settings: BakeSettings, paths: Sequence[Path]) -> tuple[Denoiser 
     if library is None:
         return None, "Open Image Denoise was not found: maps are not denoised; use --quality final"
     try:
-        return Denoiser(library, threads=settings.threads), None
+        # With a draft's few rays the small network's error does not show.
+        fast = settings.quality is Quality.DRAFT and settings.target_error is None
+        return Denoiser(library, threads=settings.threads, fast=fast), None
     except OidnError as fault:
         return None, f"{fault}: maps are not denoised; use --quality final"
 
