@@ -15,7 +15,7 @@ from rtgi_addon.backend.finish.denoise import MapDenoiser
 from rtgi_addon.backend.finish.oidn import Denoiser, find_oidn
 from rtgi_addon.backend.scene import Bool, Float32, Int32
 from rtgi_addon.backend.session import FrameResult, Session
-from rtgi_addon.backend.settings import BakeSettings, SampleCounts
+from rtgi_addon.backend.settings import SAMPLES_OF_QUALITY, BakeSettings, SampleCounts
 from rtgi_addon.backend.surface.texels import Texels
 from rtgi_addon.environment import device, library_folders, versions
 
@@ -80,7 +80,10 @@ def _run_ours(subject: Subject, meter: Meter, method: Method, seed: int) -> list
 
 
 def _settings(counts: SampleCounts, **options: Any) -> BakeSettings:
-    """Settings with sample counts that may have no name."""
+    """Settings of the quality that has these sample counts; counts without a name are put in its place."""
+    for quality, named in SAMPLES_OF_QUALITY.items():
+        if named == counts:
+            return BakeSettings(quality=quality, **options)
 
     class Counted(BakeSettings):
         samples = property(lambda self: counts)
