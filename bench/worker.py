@@ -49,8 +49,9 @@ def make_subject(scene: BenchScene) -> Subject:
     prepared = prepare(scene.blend, reference.made["resolution"])
     texels, table = texel_table(prepared)
     # Of a texel that is partly under another object, or mostly beside its surface, methods mean different parts.
-    compared = (reference.open >= 1.0) & (reference.whole >= LEAST_WHOLE)
-    return Subject(prepared, texels, reference, compared, match(reference, table))
+    texel = match(reference, table)
+    compared = (reference.open >= 1.0) & (reference.whole >= LEAST_WHOLE) & (texel >= 0)
+    return Subject(prepared, texels, reference, compared, texel)
 
 
 def _hello(subject: Subject) -> dict[str, Any]:

@@ -73,6 +73,7 @@ def errors_of(name: str, baked: Baked, *, cut: bool = False) -> Errors:
     reference = reference_of(name)
     texel = match(reference, baked.table)
     rows = (reference.open > 0) & (reference.open < 1) & baked.valid[texel] if cut else reference.open == 1
+    rows &= texel >= 0
     return compare(baked.irradiance[texel[rows]], reference.mean[rows], reference.standard_error[rows])
 
 
@@ -98,8 +99,9 @@ def test_nearly_every_texel_that_can_be_seen_is_valid(final: tuple[str, Baked]) 
     """Those that are not take their neighbours' values; they lie in cracks that only a sliver of light finds."""
     name, baked = final
     reference = reference_of(name)
-    seen = reference.open == 1
-    assert (~baked.valid[match(reference, baked.table)][seen]).mean() < 0.002
+    texel = match(reference, baked.table)
+    seen = (reference.open == 1) & (texel >= 0)
+    assert (~baked.valid[texel][seen]).mean() < 0.002
 
 
 @pytest.mark.parametrize("name", DEMOS)
