@@ -175,11 +175,10 @@ class Session:
         self._report("aim", 5, STAGE_COUNT)
         with stats.stage("denoise"):
             end = self._finisher
-            known = placed.emitted.copy()
-            known[: self.texels.count] += placed.albedo * light.aim
+            half = radiosity.gather(links, light.aim, placed.albedo, placed.emitted, from_half=True)
             iim = end.denoise(light.iim, links.stand_in)
-            half = end.denoise(links.irradiance(known, from_half=True), links.stand_in)
-        return _Lit(placed.state.frame, samples, light.aim, iim, links.stand_in, noise_estimate(iim, half))
+            estimate = noise_estimate(iim, end.denoise(half, links.stand_in))
+        return _Lit(placed.state.frame, samples, light.aim, iim, links.stand_in, estimate)
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
@@ -231,8 +230,7 @@ class Session:
         return caustics.caustic_irradiance(paths, self.texels, placed.frame, self._workers, k=k)
 
     def _links(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> Links:
-        known = placed.emitted.copy()
-        known[: self.texels.count] += placed.albedo * outside
+        known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
         bright = bright_targets(known, placed.frame.area, placed.sky, self.geometry.extent)
         tracer = GatherRays(
             self.texels, placed.frame, self.geometry, placed.surfaces, self._tracer, placed.sky, bright, samples,

@@ -48,11 +48,16 @@ def solve(links: Links, outside: Float32, albedo: Float32, emitted: Float32) -> 
     return Illumination(aim, iim, solution.products + 2, float(solution.residual.max()))
 
 
-def gather(links: Links, aim: Float32, albedo: Float32, emitted: Float32) -> Float32:
-    """(n, 3) the IIM: one product of the links with what an AIM (n, 3) sends back, plus emission and sky."""
+def sent_by_targets(irradiance: Float32, albedo: Float32, emitted: Float32) -> Float32:
+    """(m, 3) radiosity of all targets: what ``irradiance`` (n, 3) on the texels sends back, plus what is emitted."""
     radiosity = emitted.copy()
-    radiosity[: len(aim)] += albedo * aim
-    return links.irradiance(radiosity)
+    radiosity[: len(irradiance)] += albedo * irradiance
+    return radiosity
+
+
+def gather(links: Links, aim: Float32, albedo: Float32, emitted: Float32, *, from_half: bool = False) -> Float32:
+    """(n, 3) the IIM: one product of the links with what an AIM (n, 3) sends back, plus emission and sky."""
+    return links.irradiance(sent_by_targets(aim, albedo, emitted), from_half=from_half)
 
 
 def _padded(values: Float32, rows: int) -> Float32:

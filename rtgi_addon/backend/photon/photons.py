@@ -21,7 +21,7 @@ from ..progress import Report, silent
 from ..sampling import photon_numbers, unit_float32, unit_float64
 from ..scene import Float32, Float64, Int32
 from ..surface.tracing import Hits, Tracer
-from .scatter import ABSORBED, Surfaces, scatter, take_hits
+from .scatter import ABSORBED, Surfaces, scatter
 
 UInt8 = NDArray[np.uint8]
 
@@ -242,7 +242,7 @@ def _trace(
         landed = np.nonzero(hits.triangle >= 0)[0]
         if len(landed) < len(flight.path):
             flight.keep(landed)
-            hits = take_hits(hits, landed)
+            hits = hits.take(landed)
         landing = _land(flight, hits, surfaces)
         landings.append(landing)
         numbers = [unit_float32(n) for n in photon_numbers(flight.light, flight.index, bounce, seed=seed)]

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -113,7 +112,7 @@ def scatter(
     kind[kind == 1] = ABSORBED
     out = np.zeros_like(direction)
     if len(special):
-        sub = take_hits(hits, special)
+        sub = hits.take(special)
         shares, turned = _special_lobes(surfaces, sub, normal[special], direction[special], reflected[special])
         shares[0] = shares[0] * carried
         kind[special], after[special] = choose(shares, flux[special], numbers[2][special])
@@ -124,11 +123,6 @@ def scatter(
     out[rows] = sample_cosine_about(normal[rows], numbers[0][rows], numbers[1][rows])
     lift = surfaces.offset_length(position) * np.where(dot(out, normal) < 0, np.float32(-1), np.float32(1))
     return Scattered(kind, position + normal * lift[:, None], out, after)
-
-
-def take_hits(hits: Hits, rows: NDArray[np.integer[Any]]) -> Hits:
-    """Some of ``hits``."""
-    return Hits(hits.triangle[rows], hits.u[rows], hits.v[rows], hits.distance[rows], hits.back[rows])
 
 
 def choose(shares: Sequence[Float32], flux: Float32, number: Float32) -> tuple[NDArray[np.uint8], Float32]:
