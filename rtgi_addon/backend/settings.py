@@ -51,6 +51,14 @@ class AimBounced(StrEnum):
     PHOTONS = "photons"  # k nearest photons (Larsen04 §3)
 
 
+class Selection(StrEnum):
+    """How a frame finds what of the one before still holds (DESIGN §5). Maps are the same, but for PROBE's lag."""
+
+    SWEPT = "swept"  # stored photons and gather rays are tested against what moved
+    PROBE = "probe"  # one photon of each group tells for all of it (Larsen04 §2); gather rays as SWEPT
+    OFF = "off"  # every frame from scratch
+
+
 @dataclass(frozen=True)
 class SampleCounts:
     """Gather rays of one texel: ``cosine`` follow the cosine, ``bright`` are aimed at bright texels and sky."""
@@ -88,6 +96,10 @@ class BakeSettings:
     caustics: Caustics = _setting(Caustics.AUTO, "light that reaches a wall by mirror or glass")
     aim_direct: AimDirect = _setting(AimDirect.SHADOW_RAYS, "direct part of the AIM")
     aim_bounced: AimBounced = _setting(AimBounced.AUTO, "bounced part of the AIM")
+    selection: Selection = _setting(Selection.SWEPT, "how a frame finds what still holds of the one before")
+    link_memory: int = _setting(
+        4096, "MiB for gather rays kept, 13 bytes each; what does not fit is traced anew for every bounce", 1, 2**20
+    )
     direct_samples: int = _setting(8, "shadow rays per texel and lamp; 8 use each of a texel's points once", 1, 4096)
     photons: int = _setting(100_000, "photons emitted per frame, shared by the lights by their flux", 1, 100_000_000)
     nearest_photons: int = _setting(64, "photons in one irradiance estimate (k)", 4, 1024)

@@ -15,8 +15,11 @@ class FrameStats:
 
     seconds: dict[str, float] = field(default_factory=dict)  # by stage
     rays: int = 0
+    photons_probed: int = 0
+    photons_invalidated: int = 0
     photons_traced: int = 0
     photons_kept: int = 0
+    links_tested: int = 0  # kept links that an object moved near to, looked at ray by ray
     links_traced: int = 0
     links_kept: int = 0
     texels_updated: int = 0

@@ -3,7 +3,8 @@
 
 Instances that stay put share one Embree scene, built once. Each rigid mover has a scene of its own in its object
 space and the rays are transformed into it (Larsen04 §8), so moving costs no rebuilding. Deforming instances are
-rebuilt in every frame (Embree and embreex: 2.7 µs a triangle).
+rebuilt in every frame (Embree and embreex: 2.7 µs a triangle). A part that an object has left behind can still be
+tested, which is how the swept test finds what it uncovers.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
 from ..parallel import Workers
-from ..scene import Bool, Float32, FrameState, Int32, Scene
+from ..scene import Bool, Float32, Float64, FrameState, Int32, Scene
 from .geometry import Geometry
 
 
@@ -54,12 +55,48 @@ class Tracer(Protocol):
 
 
 @dataclass(frozen=True)
-class _Part:
-    """One Embree scene: the still instances together (``mover`` is None), or one mover in its object space."""
+class Part:
+    """One Embree scene: the still instances together, in local space; or a mover where it stood when this was made."""
 
     embree: Any
     triangle_of_primitive: Int32  # scene-wide
-    mover: int | None
+    to_object: Float64 | None = None  # (3, 4) from local to the mover's object space; None: rays are taken as they are
+
+    def rays(self, origins: Float32, directions: Float32) -> tuple[Float32, Float32]:
+        """Rays in the part's own space; a direction keeps its parametrisation, so distances stay comparable."""
+        if self.to_object is None:
+            return _float32(origins), _float32(directions)
+        # Sums written out: a matrix product's rounding may hang on how many rays there are.
+        x, y, z = (origins[:, k].astype(np.float64) for k in range(3))
+        dx, dy, dz = directions[:, 0], directions[:, 1], directions[:, 2]
+        moved, turned = np.empty_like(origins, np.float32), np.empty_like(directions, np.float32)
+        for k, (a, b, c, shift) in enumerate(self.to_object):
+            moved[:, k] = x * a + y * b + z * c + shift
+            turned[:, k] = dx * np.float32(a) + dy * np.float32(b) + dz * np.float32(c)
+        return moved, turned
+
+    def occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
+        """(n,) is this part hit before ``distances``?"""
+        o, d = self.rays(origins, directions)
+        return np.asarray(self.embree.run(o, d, dists=_float32(distances), query="OCCLUDED") != -1)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an object that rays can hit stood, or stands now."""
+
+    instance: int
+    part: Part
+    centre: Float64  # (3,) of a sphere around it, local
+    radius: float  # m
+
+
+@dataclass(frozen=True)
+class Movement:
+    """How the tracer's world changed from one frame to the next."""
+
+    places: tuple[Place, ...] = ()  # left behind and newly taken
+    rebuilt: bool = False  # what was said to stay put did not: nothing known about any ray holds
 
 
 class EmbreeTracer:
@@ -71,19 +108,28 @@ class EmbreeTracer:
         self._workers = workers
         self._visible: Bool = state.visible.copy()
         self._still = self._build_still()
-        self._movers = {i: self._build_mover(i, state) for i in self._present(moving=True)}
+        self._movers = {i: self._place(i, state, None) for i in self._present(moving=True)}
 
-    def update(self, state: FrameState, changed: list[int]) -> None:
+    def update(self, state: FrameState, changed: list[int]) -> Movement:
         """Follow ``geometry`` after its own update, which returned ``changed``."""
         switched = np.nonzero(state.visible != self._visible)[0].tolist()
         self._visible = state.visible.copy()
-        if any(not self._moves(i) for i in [*changed, *switched]):
+        rebuilt = any(not self._moves(i) for i in [*changed, *switched])
+        if rebuilt:
             self._still = self._build_still()
-        keep = {}
-        for index in self._present(moving=True):
-            stale = index not in self._movers or (index in changed and self._scene.instances[index].deforming)
-            keep[index] = self._build_mover(index, state) if stale else self._movers[index]
-        self._movers = keep
+        before, moved = self._movers, set(changed)
+        self._movers = {
+            i: before[i] if i in before and i not in moved else self._place(i, state, before.get(i))
+            for i in self._present(moving=True)
+        }
+        places = [
+            place
+            for i in sorted(before.keys() | self._movers.keys())
+            if before.get(i) is not self._movers.get(i)
+            for place in (before.get(i), self._movers.get(i))
+            if place is not None
+        ]
+        return Movement(tuple(places), rebuilt)
 
     def intersect(self, origins: Float32, directions: Float32) -> Hits:
         chunks = self._workers.map_slices(lambda s: self._intersect(origins[s], directions[s]), len(origins))
@@ -121,40 +167,39 @@ class EmbreeTracer:
             and self._geometry.triangles_of(i).start < self._geometry.triangles_of(i).stop
         ]
 
-    def _build_still(self) -> _Part | None:
+    def _build_still(self) -> Part | None:
         indices = self._present(moving=False)
         if not indices:
             return None
         rows = np.concatenate([np.arange(s.start, s.stop) for s in map(self._geometry.triangles_of, indices)])
-        return _part(self._geometry.corners[rows], rows, None)
+        return _part(self._geometry.corners[rows], rows)
 
-    def _build_mover(self, index: int, state: FrameState) -> _Part:
-        mesh_index = self._scene.instances[index].mesh
-        mesh = self._scene.meshes[mesh_index]
-        vertices = state.vertices.get(mesh_index, mesh.vertices)
-        rows = self._geometry.triangles_of(index)
-        return _part(vertices[mesh.triangles], np.arange(rows.start, rows.stop), index)
-
-    def _rays_of(self, part: _Part, origins: Float32, directions: Float32) -> tuple[Float32, Float32]:
-        """Rays in the part's own space; a direction keeps its parametrisation, so distances stay comparable."""
-        if part.mover is None:
-            return origins, directions
-        matrix = self._geometry.matrix_world[part.mover]
+    def _place(self, index: int, state: FrameState, before: Place | None) -> Place:
+        """Where a mover stands; its triangles are built anew only where they deform."""
+        matrix = self._geometry.matrix_world[index]
         inverse = np.linalg.pinv(matrix[:3, :3])  # a flat transform still gets an answer
-        shift = self._geometry.origin - matrix[:3, 3]
-        linear = inverse.T.astype(np.float32)
-        return (origins.astype(np.float64) + shift) @ inverse.T, directions @ linear
+        shift = inverse @ (self._geometry.origin - matrix[:3, 3])
+        to_object = np.concatenate([inverse, shift[:, None]], axis=1)
+        rows = self._geometry.triangles_of(index)
+        if before is not None and not self._scene.instances[index].deforming:
+            part = Part(before.part.embree, before.part.triangle_of_primitive, to_object)
+        else:
+            mesh_index = self._scene.instances[index].mesh
+            mesh = self._scene.meshes[mesh_index]
+            vertices = state.vertices.get(mesh_index, mesh.vertices)
+            part = _part(vertices[mesh.triangles], np.arange(rows.start, rows.stop), to_object)
+        return Place(index, part, *_sphere(self._geometry.corners[rows], self._geometry))
 
     def _intersect(self, origins: Float32, directions: Float32) -> Hits:
         count = len(origins)
         triangle = np.full(count, -1, np.int32)
         u, v = np.zeros(count, np.float32), np.zeros(count, np.float32)
         distance = np.full(count, np.inf, np.float32)
-        for part in [p for p in (self._still, *self._movers.values()) if p is not None]:
-            o, d = self._rays_of(part, origins, directions)
-            found = part.embree.run(_float32(o), _float32(d), dists=distance, output=True)
+        for part in self._parts():
+            o, d = part.rays(origins, directions)
+            found = part.embree.run(o, d, dists=distance, output=True)
             new = found["primID"] >= 0
-            if part.mover is None and new.all():
+            if part is self._still and new.all():
                 triangle, u, v = part.triangle_of_primitive[found["primID"]], found["u"], found["v"]
                 distance = found["tfar"]
                 continue
@@ -167,17 +212,30 @@ class EmbreeTracer:
 
     def _occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
         blocked = np.zeros(len(origins), np.bool_)
-        for part in [p for p in (self._still, *self._movers.values()) if p is not None]:
-            o, d = self._rays_of(part, origins, directions)
-            blocked |= part.embree.run(_float32(o), _float32(d), dists=distances, query="OCCLUDED") != -1
+        for part in self._parts():
+            blocked |= part.occluded(origins, directions, distances)
         return blocked
 
+    def _parts(self) -> list[Part]:
+        return [p for p in (self._still, *(place.part for place in self._movers.values())) if p is not None]
 
-def _part(corners: Float32, rows: Any, mover: int | None) -> _Part:
+
+def _part(corners: Float32, rows: Any, to_object: Float64 | None = None) -> Part:
     embree = EmbreeScene()
     # Embree ignores a triangle with a non-finite corner; a degenerate one is never hit.
     TriangleMesh(embree, np.ascontiguousarray(corners, np.float32))
-    return _Part(embree, rows.astype(np.int32), mover)
+    return Part(embree, rows.astype(np.int32), to_object)
+
+
+def _sphere(corners: Float32, geometry: Geometry) -> tuple[Float64, float]:
+    """((3,), m) a sphere around the finite ones of ``corners`` (t, 3, 3), wider by more than rays are lifted."""
+    points = corners.reshape(-1, 3).astype(np.float64)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return np.zeros(3), 0.0
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    radius = float(np.sqrt(((points - centre) ** 2).sum(axis=1).max()))
+    return centre, radius * (1 + 1e-4) + 4 * float(geometry.offset_length(_float32(centre[None]) + radius)[0])
 
 
 def _float32(array: Any) -> Float32:
