@@ -11,10 +11,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from .backend.progress import Report
-from .backend.scene import Float64, Mesh, Scene
+from .backend.scene import Mesh, Scene
 from .backend.settings import BakeSettings
 from .extract import Appearance
-from .source import Layout, SourceMesh, SourceScene
+from .source import Layout, SourceScene, world_area
 from .unwrap import unwrap
 
 #: Share of a page that charts cover, roughly (38-56 % measured); only margins between islands depend on it.
@@ -66,8 +66,8 @@ def assemble(source: SourceScene, layouts: Sequence[Layout], appearance: Appeara
 
 def expected_densities(source: SourceScene, settings: BakeSettings) -> list[float]:
     """About how many texels an object-space metre of each mesh will get, in its largest instance."""
-    own = [_area(mesh, np.eye(3)) for mesh in source.meshes]
-    in_world = [_area(source.meshes[i.mesh], i.matrix_world[:3, :3]) for i in source.instances]
+    own = [world_area(mesh, np.eye(3)) for mesh in source.meshes]
+    in_world = [world_area(source.meshes[i.mesh], i.matrix_world[:3, :3]) for i in source.instances]
     scale = np.zeros(len(own))  # world metres per object metre
     for instance, area in zip(source.instances, in_world, strict=True):
         if own[instance.mesh] > 0:
@@ -77,11 +77,3 @@ def expected_densities(source: SourceScene, settings: BakeSettings) -> list[floa
         total = sum(in_world)
         density = settings.resolution * float(np.sqrt(COVERAGE / total)) if total > 0 else 1.0
     return [density * float(s) if s > 0 else density for s in scale]
-
-
-def _area(mesh: SourceMesh, linear: Float64) -> float:
-    """m² of all finite triangles under ``linear`` (3, 3)."""
-    corners = np.einsum("tci,ji->tcj", mesh.vertices[mesh.triangles], np.asarray(linear, np.float64))
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = 0.5 * np.sqrt(np.einsum("ti,ti->t", cross, cross))
-    return float(np.sum(area[np.isfinite(area)]))

@@ -23,9 +23,10 @@ from .extract.source_scene import frame_kept
 from .lightmap_nodes import make_group, remove_group
 from .lightmap_sampling import MARK, OFFSET_PROPERTIES, SCALE_PROPERTIES, UV_LAYER, MapFiles
 from .lightmap_slots import light_materials, unlight_materials
+from .motion import Motion, motions, span_shown, to_rigid
 from .point_cache import play_pc2, write_pc2
 from .source import Layout, SourceScene
-from .standins import Motion, Survey, add_object, hide_originals, make_mesh, motions, remove_standins, survey, to_rigid
+from .standins import Survey, add_object, hide_originals, make_mesh, remove_standins, survey
 from .unwrap import loop_uv, write_uv_layer
 
 _UV_ADDED = MARK + "_uv"
@@ -172,9 +173,9 @@ def _add_standins(
             data = shared[mesh] = shared.get(mesh) or make_mesh(copy, source.meshes[mesh].name, uv)
         obj = add_object(name, data, motion, maps.frames)
         if motion.vertices is not None:
-            path = maps.folder / f"standin.{index:04d}.pc2"
-            write_pc2(path, motion.vertices)
-            play_pc2(obj, path, maps.frames)
+            path, span = maps.folder / f"standin.{index:04d}.pc2", span_shown(motion)
+            write_pc2(path, motion.vertices[span])
+            play_pc2(obj, path, maps.frames[span])
         if _set_placement(obj, atlas.front[index], atlas.back[index]):
             lit.append(obj)
     return lit

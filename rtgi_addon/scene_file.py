@@ -16,7 +16,7 @@ from .extract.nodes import reachable, uses_nodes
 
 #: Modifiers whose result depends on the frame though nothing has an animation curve.
 TIME_MODIFIERS = {
-    "CLOTH", "COLLISION", "DYNAMIC_PAINT", "EXPLODE", "FLUID", "MESH_CACHE", "MESH_SEQUENCE_CACHE", "OCEAN",
+    "BUILD", "CLOTH", "COLLISION", "DYNAMIC_PAINT", "EXPLODE", "FLUID", "MESH_CACHE", "MESH_SEQUENCE_CACHE", "OCEAN",
     "PARTICLE_SYSTEM", "SOFT_BODY", "WAVE",
 }  # fmt: skip
 MATERIAL_OUTPUT, WORLD_OUTPUT = "ShaderNodeOutputMaterial", "ShaderNodeOutputWorld"

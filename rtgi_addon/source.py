@@ -9,7 +9,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .backend.scene import Float32, Instance, Int32, Light, World
+import numpy as np
+
+from .backend.scene import Float32, Float64, Instance, Int32, Light, World
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class SourceScene:
     lights: tuple[Light, ...]
     world: World | None
     warnings: tuple[str, ...] = ()
-    keys: tuple[tuple[str | int, ...], ...] = ()  # what finds each instance again in another frame
+    keys: tuple[tuple[str | int, ...], ...] = ()  # by instance: what finds its object again in another frame
+    looks: tuple[bytes | None, ...] = ()  # by instance: which variant of its object it is; None: the only one
     first_frames: tuple[int, ...] = ()  # by instance: where it is first seen
     lit: bool = True  # a lamp or the sky gives light in some frame
 
@@ -48,3 +51,11 @@ class Layout:
     corner_uv: Float32  # (t, 3, 2) in [0, 1]
     island_of_triangle: Int32  # (t,)
     size: tuple[float, float]  # object-space metres that the unit of u and of v spans; 0 for a mesh without area
+
+
+def world_area(mesh: SourceMesh, linear: Float64) -> float:
+    """m² of all finite triangles under ``linear`` (3, 3)."""
+    corners = np.einsum("tci,ji->tcj", mesh.vertices[mesh.triangles], np.asarray(linear, np.float64))
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.sqrt(np.einsum("ti,ti->t", cross, cross))
+    return float(np.sum(area[np.isfinite(area)]))

@@ -2,8 +2,9 @@
 """Stand-ins: mesh objects that show light maps for what has no place of its own for UVs and properties.
 
 The rule: an object keeps itself if it is a local mesh object whose modifiers leave its faces alone, which instances
-nothing and has room for the layer. All else (instances, generated geometry, curves, text, objects of a library) is
-hidden from renders and shown by stand-ins: its evaluated mesh with all attributes, one object for each instance.
+nothing and has room for the layer. All else (instances, generated geometry, curves, text, objects of a library, objects
+whose faces or materials change) is hidden and shown by stand-ins: its evaluated mesh with all attributes, one object
+for each instance and each of its variants.
 """
 
 from __future__ import annotations
@@ -16,15 +17,19 @@ import numpy as np
 from mathutils import Matrix
 from numpy.typing import NDArray
 
-from .backend.scene import Float32, Float64, FrameState, Int32
+from .backend.scene import Float32, Int32
 from .extract.meshes import loop_normals, positions, topology_digest
 from .extract.placed import identify, placed_meshes
+from .extract.variants import Finder
 from .lightmap_nodes import animation_curves
 from .lightmap_sampling import MARK, UV_LAYER
+from .motion import Motion
 from .source import SourceScene
 
 COLLECTION = "RTGI stand-ins"
-_HIDDEN, _MUTED = "rtgi_hidden", "rtgi_muted"
+#: What hides an object, in renders and in the viewport, and where a hidden original remembers how that was.
+_HIDDEN = {"hide_render": "rtgi_hidden", "hide_viewport": "rtgi_hidden_viewport"}
+_MUTED = "rtgi_muted"
 
 #: How ``foreach_get`` reads an attribute of a type: property, components, dtype.
 _VALUES = {
@@ -78,16 +83,17 @@ class Survey:
 
 def survey(depsgraph: bpy.types.Depsgraph, source: SourceScene, found: Survey) -> Survey:
     """Decide for each instance of ``source`` that this frame shows and ``found`` does not know; adds to ``found``."""
-    index_of = {key: index for index, key in enumerate(source.keys)}
+    finder = Finder(source)
     instancers = {key[0] for key in source.keys if key[0]}
     objects = {obj.name_full: obj for obj in bpy.data.objects}
     for placed in placed_meshes(depsgraph, lambda line: None):
-        index = index_of.get(placed.key)
+        index = finder.index_or_none(placed)
         if index is None or index in found.known:
             continue
         found.known.add(index)
         mesh, obj = source.instances[index].mesh, objects.get(str(placed.key[1]))
-        alone = not placed.key[0] and (*placed.key[:-1], 1) not in index_of and placed.key[1] not in instancers
+        alone = source.looks[index] is None and not placed.key[0] and not finder.knows((*placed.key[:-1], 1))
+        alone = alone and placed.key[1] not in instancers
         has_layout = source.meshes[mesh].rtgi_uv is not None
         if alone and obj is not None and _keeps_itself(obj, placed.data, has_layout=has_layout):
             # Two objects may share a mesh and differ by their modifiers, and so in their layouts.
@@ -185,45 +191,6 @@ def make_mesh(copy: MeshCopy, name: str, loop_uv: Float32) -> bpy.types.Mesh:
     return mesh
 
 
-@dataclass
-class Motion:
-    """One stand-in over the frames: matrices (f, 4, 4), shown (f,), vertices f × (v, 3) if it deforms."""
-
-    matrix: Float64
-    shown: NDArray[np.bool_]
-    vertices: list[Float32] | None = None
-
-
-def motions(source: SourceScene, states: Sequence[FrameState], chosen: Sequence[int]) -> dict[int, Motion]:
-    """The motion of the ``chosen`` instances; read before the scene is changed, for it is the scene's own."""
-    out = {}
-    for index in chosen:
-        instance = source.instances[index]
-        rest = source.meshes[instance.mesh].vertices
-        vertices = [s.vertices.get(instance.mesh, rest) for s in states] if instance.deforming else None
-        matrix = np.array([s.matrix_world[index] for s in states])
-        out[index] = Motion(matrix, np.array([s.visible[index] for s in states]), vertices)
-    return out
-
-
-def to_rigid(motion: Motion, rest: Float32) -> Motion:
-    """The same motion with matrices that an object can have: a shear, which it cannot, goes into the vertices."""
-    if all(_is_rigid_or_scaled(m) for m in motion.matrix):
-        return motion
-    vertices = motion.vertices or [rest] * len(motion.matrix)
-    mirror = np.diag([-1.0, 1.0, 1.0, 1.0]) if np.linalg.det(motion.matrix[0][:3, :3]) < 0 else np.eye(4)
-    world = [mirror @ m for m in motion.matrix]  # the mirror is its own inverse
-    moved = [
-        (v.astype(np.float64) @ m[:3, :3].T + m[:3, 3]).astype(np.float32) for v, m in zip(vertices, world, strict=True)
-    ]
-    return Motion(np.repeat(mirror[None], len(world), axis=0), motion.shown, moved)
-
-
-def _is_rigid_or_scaled(matrix: Float64) -> bool:
-    again = np.array(Matrix.LocRotScale(*Matrix(matrix.tolist()).decompose()))
-    return bool(np.allclose(again, matrix, rtol=1e-5, atol=1e-5 * np.abs(matrix[:3, :3]).max()))
-
-
 def standin_collection() -> bpy.types.Collection:
     """The collection of stand-ins, made if need be."""
     collection = next((c for c in bpy.data.collections if c.get(MARK)), None)
@@ -242,49 +209,65 @@ def add_object(name: str, data: bpy.types.ID, motion: Motion, frames: Sequence[i
     obj.rotation_mode = "QUATERNION"
     moves = bool((motion.matrix != motion.matrix[0]).any())
     blinks = bool((motion.shown != motion.shown[0]).any())
+    before = None
     for matrix, shown, frame in zip(motion.matrix, motion.shown, frames, strict=True):
-        before = obj.rotation_quaternion.copy()
-        obj.matrix_basis = Matrix(matrix.tolist())
-        rotation = obj.rotation_quaternion.copy()
-        rotation.make_compatible(before)
-        obj.rotation_quaternion = rotation
-        obj.hide_render = not shown
+        if before is None or moves:
+            _set_matrix(obj, Matrix(matrix.tolist()))
         for path in ("location", "rotation_quaternion", "scale") if moves else ():
             obj.keyframe_insert(path, frame=frame)
-        if blinks:
-            obj.keyframe_insert("hide_render", frame=frame)
-        if not moves and not blinks:
-            break
+        if shown != before:
+            _show(obj, shown=bool(shown), frame=frame if blinks else None)
+        before = shown
     if obj.animation_data is not None:
         obj.animation_data.action[MARK] = True
         for curve in animation_curves(obj.animation_data):
             for key in curve.keyframe_points:
-                key.interpolation = "LINEAR"
+                key.interpolation = "CONSTANT" if curve.data_path in _HIDDEN else "LINEAR"
     return obj
 
 
+def _set_matrix(obj: bpy.types.Object, matrix: Matrix) -> None:
+    """Without a turn by the long way round since the matrix before."""
+    before = obj.rotation_quaternion.copy()
+    obj.matrix_basis = matrix
+    rotation = obj.rotation_quaternion.copy()
+    rotation.make_compatible(before)
+    obj.rotation_quaternion = rotation
+
+
+def _show(obj: bpy.types.Object, *, shown: bool, frame: int | None) -> None:
+    """From ``frame`` on, if given."""
+    for path in _HIDDEN:
+        setattr(obj, path, not shown)
+        if frame is not None:
+            obj.keyframe_insert(path, frame=frame)
+
+
 def hide_originals(names: Iterable[str]) -> None:
-    """Take the objects of these full names out of renders, remembering how they were."""
+    """Take the objects of these full names out of renders and viewports, remembering how they were."""
     objects = {obj.name_full: obj for obj in bpy.data.objects}
     for obj in (objects[name] for name in names if name in objects):
         animation = obj.animation_data
         for curve in [] if animation is None else [*animation_curves(animation), *animation.drivers]:
-            if curve.data_path == "hide_render" and not curve.mute:
+            if curve.data_path in _HIDDEN and not curve.mute:
                 curve.mute = True
                 obj[_MUTED] = True
-        obj[_HIDDEN] = obj.hide_render
-        obj.hide_render = True
+        for path, kept in _HIDDEN.items():
+            obj[kept] = getattr(obj, path)
+            setattr(obj, path, True)
 
 
 def remove_standins() -> None:
     """Remove all stand-ins and show the originals again."""
-    for obj in [o for o in bpy.data.objects if _HIDDEN in o]:
-        obj.hide_render = bool(obj[_HIDDEN])
-        del obj[_HIDDEN]
+    for obj in [o for o in bpy.data.objects if _HIDDEN["hide_render"] in o]:
+        for path, kept in _HIDDEN.items():
+            if kept in obj:
+                setattr(obj, path, bool(obj[kept]))
+                del obj[kept]
         if obj.get(_MUTED):
             del obj[_MUTED]
             for curve in [*animation_curves(obj.animation_data), *obj.animation_data.drivers]:
-                if curve.data_path == "hide_render":
+                if curve.data_path in _HIDDEN:
                     curve.mute = False
     for kind in ("objects", "collections", "meshes", "actions"):
         blocks = getattr(bpy.data, kind)

@@ -19,6 +19,7 @@ from . import lights, materials, world
 from .as_rendered import read_as_rendered
 from .meshes import loop_normals, positions
 from .placed import Placed, placed_meshes
+from .variants import Finder
 
 
 @dataclass
@@ -60,13 +61,13 @@ def _told_already(_line: str) -> None:
 
 
 def _read(depsgraph: bpy.types.Depsgraph, source: SourceScene, frame: int) -> Reading:
-    index_of = {key: index for index, key in enumerate(source.keys)}
+    finder = Finder(source)
     still = np.array([i.matrix_world for i in source.instances], np.float64).reshape(-1, 4, 4)
     reading = Reading(still, np.zeros(len(still), np.bool_))
     for placed in placed_meshes(depsgraph, _told_already):
-        index = index_of.get(placed.key)
+        index = finder.index_or_none(placed)
         if index is None:
-            raise BakeError(f"{placed.name}: appears in frame {frame}, which the bake was not told of; bake it again")
+            raise BakeError(_unknown(placed, frame, seen=finder.knows(placed.key)))
         reading.matrix[index] = placed.matrix
         reading.visible[index] = True
         instance = source.instances[index]
@@ -76,11 +77,21 @@ def _read(depsgraph: bpy.types.Depsgraph, source: SourceScene, frame: int) -> Re
     return reading
 
 
+def _unknown(placed: Placed, frame: int, *, seen: bool) -> str:
+    if not seen:
+        return f"{placed.name}: appears in frame {frame}, which the bake was not told of; bake it again"
+    return (
+        f"{placed.name}: has other faces or materials in frame {frame} than when that frame was first looked at; bake "
+        "its simulation to disk first, so that a frame is always the same"
+    )
+
+
 def _read_deformed(placed: Placed, source: SourceScene, mesh: int, frame: int, reading: Reading) -> None:
     known, vertices = source.meshes[mesh], positions(placed.data)
     if len(vertices) != len(known.vertices) or len(placed.data.loops) <= known.loop_of_corner.max(initial=-1):
         raise BakeError(
-            f"{placed.name}: has other faces in frame {frame} than at first; apply or freeze what changes them"
+            f"{placed.name}: has other faces in frame {frame} than when that frame was first looked at; bake its "
+            "simulation to disk first, so that a frame is always the same"
         )
     # Vertices that are not finite in any frame belong to no triangle.
     reading.vertices[mesh] = np.nan_to_num(vertices, posinf=0, neginf=0)

@@ -19,6 +19,7 @@ from .placed import placed_meshes
 from .proxies import Carried, build_proxy, read_carried
 from .stepping import frame_kept
 from .texture_bake import bake_over_uv, bake_slots
+from .variants import Finder
 
 #: Samples per texel of a textured mesh: texels are coarser than most textures.
 TEXTURE_SAMPLES = 4
@@ -70,12 +71,12 @@ def carried_of(source: SourceScene, meshes: Sequence[int]) -> dict[int, Carried]
     """By mesh: what shaders read of its first instance, at the frame where that is first seen."""
     scene, view_layer = bpy.context.scene, bpy.context.view_layer
     first = {mesh: next(i for i, inst in enumerate(source.instances) if inst.mesh == mesh) for mesh in meshes}
-    mesh_of_key = {source.keys[instance]: mesh for mesh, instance in first.items()}
+    mesh_of_instance, finder = {instance: mesh for mesh, instance in first.items()}, Finder(source)
     found: dict[int, Carried] = {}
 
     def read(depsgraph: bpy.types.Depsgraph) -> None:
         for placed in placed_meshes(depsgraph, lambda _line: None):
-            mesh = mesh_of_key.get(placed.key)
+            mesh = mesh_of_instance.get(finder.index_or_none(placed))
             if mesh is not None and mesh not in found:
                 found[mesh] = read_carried(placed.object, placed.data, placed.matrix)
 

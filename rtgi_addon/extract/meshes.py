@@ -34,6 +34,14 @@ class MeshArrays:
     rtgi_uv: Float32 | None  # (t, 3, 2)
 
 
+@dataclass(frozen=True)
+class Faces:
+    """What tells the faces of two meshes apart."""
+
+    digest: bytes
+    slots: tuple[int, ...]  # material slots that faces are in, rising
+
+
 def positions(mesh: bpy.types.Mesh) -> Float32:
     """(v, 3) object."""
     flat = np.zeros(len(mesh.vertices) * 3, np.float32)
@@ -56,6 +64,18 @@ def topology_digest(mesh: bpy.types.Mesh) -> bytes:
     starts = np.zeros(len(mesh.polygons), np.int32)
     mesh.polygons.foreach_get("loop_start", starts)
     return digest_of(np.array([len(mesh.vertices)]), corners, starts)
+
+
+def faces_of(mesh: bpy.types.Mesh) -> Faces:
+    """The same for the same faces over the same vertices in the same material slots."""
+    slots = _polygon_slots(mesh)
+    digest = digest_of(np.frombuffer(topology_digest(mesh), np.uint8), slots)
+    return Faces(digest, tuple(np.unique(slots).tolist()))
+
+
+def shape_digest(mesh: bpy.types.Mesh) -> bytes:
+    """The same for the same places of all vertices and the same shading normals."""
+    return digest_of(positions(mesh), loop_normals(mesh))
 
 
 def digest_of(*arrays: NDArray[np.generic]) -> bytes:

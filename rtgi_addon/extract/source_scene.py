@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The user's scene over the frames of a bake: which meshes there are, who uses them, what moves and what deforms.
 
-Every frame is visited once, since only that tells a mover from a still object and finds meshes whose faces change.
+Every frame is visited once, since only that tells a mover from a still object and finds objects whose faces change.
 """
 
 from __future__ import annotations
@@ -18,9 +18,10 @@ from ..backend.scene import Bool, Instance, Light, World
 from ..source import SourceMesh, SourceScene
 from . import lights, world
 from .as_rendered import read_as_rendered
-from .meshes import MeshArrays, digest_of, positions, read_mesh, topology_digest, without_vertices
+from .meshes import Faces, MeshArrays, faces_of, positions, read_mesh, shape_digest, without_vertices
 from .placed import Key, Placed, placed_meshes
 from .stepping import frame_kept
+from .variants import MAX_EXTRA_TRIANGLES, MAX_VARIANTS, coarseness, look_of, variant_name
 
 #: What one instance uses in one frame: the number of an evaluated mesh of that frame.
 MeshUse = int
@@ -28,7 +29,7 @@ MeshUse = int
 
 @dataclass
 class Seen:
-    """One instance over the frames."""
+    """One instance over the frames: one look of an object."""
 
     first: Placed
     uses: dict[int, MeshUse] = field(default_factory=dict)  # by frame
@@ -40,12 +41,14 @@ class Census:
     """All that the visits to the frames found."""
 
     warnings: list[str] = field(default_factory=list)
-    seen: dict[Key, Seen] = field(default_factory=dict)
+    seen: dict[Key, dict[bytes, Seen]] = field(default_factory=dict)  # by object and look
     arrays: dict[tuple[int, MeshUse], MeshArrays] = field(default_factory=dict)  # where an instance is first met
-    digest: dict[tuple[int, MeshUse], tuple[bytes, bytes]] = field(default_factory=dict)  # topology, vertices
+    faces: dict[tuple[int, MeshUse], Faces] = field(default_factory=dict)
+    shape: dict[tuple[int, MeshUse], bytes] = field(default_factory=dict)  # differs where vertices or normals do
     bad: dict[tuple[int, MeshUse], Bool] = field(default_factory=dict)  # non-finite vertices
     lamps: dict[int, tuple[Light, ...]] = field(default_factory=dict)  # by frame
     lit: bool = False  # by a lamp or the sky, in any frame
+    extra_triangles: int = 0  # of all looks of objects but their first
 
     def warn(self, line: str) -> None:
         if line not in self.warnings:
@@ -85,65 +88,66 @@ def _visit(depsgraph: bpy.types.Depsgraph, frame: int, census: Census) -> None:
     for placed in placed_meshes(depsgraph, census.warn):
         address = placed.data.as_pointer()
         use = number_of.setdefault(address, len(number_of))
-        if (frame, use) not in census.digest:
+        if (frame, use) not in census.shape:
             _examine(placed, (frame, use), census)
-        known = census.seen.get(placed.key)
+        looks, look = census.seen.setdefault(placed.key, {}), look_of(placed, census.faces[frame, use])
+        known = looks.get(look)
         if known is None:
-            known = census.seen[placed.key] = Seen(replace(placed, data=None, object=None))
+            known = looks[look] = Seen(replace(placed, data=None, object=None))
             if (frame, use) not in census.arrays:
                 census.arrays[frame, use] = read_mesh(placed.data, placed.name, warn=census.warn)
+            _require_few(placed.name, len(looks), census, (frame, use))
         else:
             known.moving |= not np.array_equal(known.first.matrix, placed.matrix)
-            _check_same_faces(known, placed, frame, census.digest, use)
         known.uses[frame] = use
     census.lamps[frame] = lights.lights_of(depsgraph, census.warn)
     census.lit |= any(max(lamp.power) > 0 for lamp in census.lamps[frame])
 
 
 def _examine(placed: Placed, at: tuple[int, MeshUse], census: Census) -> None:
-    vertices = positions(placed.data)
-    census.digest[at] = (topology_digest(placed.data), digest_of(vertices))
-    finite = np.isfinite(vertices).all(axis=1)
+    census.faces[at], census.shape[at] = faces_of(placed.data), shape_digest(placed.data)
+    finite = np.isfinite(positions(placed.data)).all(axis=1)
     if not finite.all():
         census.bad[at] = ~finite
 
 
-def _check_same_faces(
-    known: Seen, placed: Placed, frame: int, digest: dict[tuple[int, MeshUse], tuple[bytes, bytes]], use: MeshUse
-) -> None:
-    first = next(iter(known.uses.items()))
-    if digest[first][0] != digest[frame, use][0]:
+def _require_few(name: str, looks: int, census: Census, at: tuple[int, MeshUse]) -> None:
+    """Refuse an object that changes so often that its maps would be of no use, or fill the memory."""
+    if looks > 1:
+        census.extra_triangles += len(census.arrays[at].triangles)
+    if looks > MAX_VARIANTS or census.extra_triangles > MAX_EXTRA_TRIANGLES:
         raise BakeError(
-            f"{placed.name}: its faces change between frame {first[0]} and frame {frame}; apply or freeze the modifier "
-            "or shape that adds or removes faces, or bake the frames before and after apart"
+            f"{name}: its faces or materials change too often, {looks} times up to frame {at[0]}, and it needs other "
+            "light maps each time; bake fewer frames at a time with --frames, or give it fewer faces"
         )
 
 
 def _assemble(census: Census, frames: Sequence[int], sky: World | None) -> SourceScene:
     """Instances that use the same mesh with the same materials in every frame share a SourceMesh."""
-    names = unique_names([s.first.name for s in census.seen.values()])
     material_index: dict[str | None, int] = {}
     mesh_index: dict[tuple[object, ...], int] = {}
     meshes: list[SourceMesh] = []
     instances: list[Instance] = []
-    for name, seen in zip(names, census.seen.values(), strict=True):
+    names, objects = _names(census, frames)
+    for name, seen in zip(names, _all_seen(census), strict=True):
         group = (tuple(sorted(seen.uses.items())), seen.first.materials)
         if group not in mesh_index:
             mesh_index[group] = len(meshes)
             meshes.append(_source_mesh(seen, census, material_index))
-        vertices = {census.digest[at][1] for at in seen.uses.items()}
         instances.append(
             Instance(
                 name=name,
                 mesh=mesh_index[group],
                 matrix_world=seen.first.matrix,
                 moving=seen.moving or len(seen.uses) < len(set(frames)),
-                deforming=len(vertices) > 1,
+                deforming=len({census.shape[at] for at in seen.uses.items()}) > 1,
                 blocks_light=seen.first.blocks_light,
                 receives_light=seen.first.receives_light,
             )
         )
     _require_faces(meshes)
+    if line := coarseness(meshes, instances, objects):
+        census.warn(line)
     return SourceScene(
         meshes=tuple(meshes),
         instances=tuple(instances),
@@ -151,10 +155,28 @@ def _assemble(census: Census, frames: Sequence[int], sky: World | None) -> Sourc
         lights=census.lamps[frames[0]],
         world=sky,
         warnings=tuple(census.warnings),
-        keys=tuple(census.seen),
-        first_frames=tuple(next(iter(seen.uses)) for seen in census.seen.values()),
+        keys=tuple(key for key, looks in census.seen.items() for _ in looks),
+        looks=tuple(look if len(looks) > 1 else None for looks in census.seen.values() for look in looks),
+        first_frames=tuple(next(iter(seen.uses)) for seen in _all_seen(census)),
         lit=census.lit,
     )
+
+
+def _all_seen(census: Census) -> list[Seen]:
+    """In the order of the scene's instances: those of one object side by side."""
+    return [seen for looks in census.seen.values() for seen in looks.values()]
+
+
+def _names(census: Census, frames: Sequence[int]) -> tuple[list[str], dict[str, list[int]]]:
+    """The name of each instance, unique; and by the names of objects, the numbers of each one's instances."""
+    names: list[str] = []
+    objects: dict[str, list[int]] = {}
+    variants = [list(looks.values()) for looks in census.seen.values()]
+    for name, of_object in zip(unique_names([seen[0].first.name for seen in variants]), variants, strict=True):
+        objects[name] = list(range(len(names), len(names) + len(of_object)))
+        several = len(of_object) > 1
+        names += [variant_name(name, list(seen.uses), frames) if several else name for seen in of_object]
+    return unique_names(names), objects
 
 
 def _source_mesh(seen: Seen, census: Census, material_index: dict[str | None, int]) -> SourceMesh:

@@ -190,6 +190,16 @@ def test_lamp_that_is_lit_in_one_frame_of_many() -> None:
     assert front.tolist() == [True] and back.tolist() == [False]
 
 
+def test_what_is_shown_for_a_moment_is_not_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forty objects, each there in one state alone, and time to look at four states."""
+    monkeypatch.setattr("rtgi_addon.backend.layout.sides.MOST_RAYS", 1)
+    monkeypatch.setattr("rtgi_addon.backend.layout.sides.LEAST_STATES", 4)
+    scene = make(*((plane(), translation(3 * i, 0, 0)) for i in range(40)), world=SKY)
+    states = [replace(scene.first_frame(), visible=np.arange(40) == i) for i in range(40)]
+    front, back = lit_sides(scene, states)
+    assert front.all() and back.all()
+
+
 def test_unchanging_states_cost_nothing() -> None:
     """Only a lamp's power changes: one look is enough, and later states are read but not traced."""
     scene, _ = cornell()

@@ -142,35 +142,6 @@ def test_objects_appear_and_vanish(add_cube: AddObject) -> None:
     assert source.first_frames[late] == 3
 
 
-def test_changing_faces_are_an_error_that_names_frame_and_remedy(add_plane: AddObject) -> None:
-    obj = add_plane("Grower")
-    array = obj.modifiers.new("Array", "ARRAY")
-    animate(array, "count", (1, 1), (4, 3))
-    with pytest.raises(BakeError) as fault:
-        extract_source([1, 2, 3, 4], silent)
-    (problem,) = fault.value.problems
-    assert problem.startswith("Grower: its faces change between frame 1 and frame")
-    assert "apply or freeze" in problem
-
-
-def test_same_counts_but_other_faces_are_seen(add_mesh: AddObject) -> None:
-    """A flipped diagonal keeps all counts; only the topology itself tells."""
-    obj = add_mesh("Flip", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [(0, 1, 2), (0, 2, 3)])
-    other = bpy.data.meshes.new("Other")
-    other.from_pydata([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)], [], [(0, 1, 3), (1, 2, 3)])
-    first = obj.data
-
-    def swap(scene: bpy.types.Scene, *_args: object) -> None:
-        obj.data = other if scene.frame_current > 1 else first
-
-    bpy.app.handlers.frame_change_pre.append(swap)
-    try:
-        with pytest.raises(BakeError, match="Flip: its faces change between frame 1 and frame 2"):
-            extract_source([1, 2], silent)
-    finally:
-        bpy.app.handlers.frame_change_pre.remove(swap)
-
-
 def test_lamps_move_and_change(add_cube: AddObject) -> None:
     add_cube()
     data = bpy.data.lights.new("Lamp", "POINT")

@@ -72,7 +72,7 @@ def lit_sides(scene: Scene, states: Sequence[FrameState], *, workers: Workers | 
         first = last = states[0]
         geometry = Geometry(scene, first)
         tracer = EmbreeTracer(scene, geometry, first, own_workers)
-        for index in _tested_states(len(states), len(lit)):
+        for index in _tested_states(states, len(lit)):
             state = states[index] if index else first
             if index and not _differ(last, state):
                 continue
@@ -86,10 +86,18 @@ def lit_sides(scene: Scene, states: Sequence[FrameState], *, workers: Workers | 
     return lit[0::2] & receives, lit[1::2] & receives
 
 
-def _tested_states(states: int, sides: int) -> list[int]:
-    """Indices of the states to look at: all that MOST_RAYS allows, the first and the last among them."""
+def _tested_states(states: Sequence[FrameState], sides: int) -> list[int]:
+    """Indices of the states to look at: all that MOST_RAYS allows, the first and the last among them, and one more for
+    what none of these shows."""
     most = max(LEAST_STATES, MOST_RAYS // (max(sides, 1) * RAYS_OF_SIDE[0]))
-    return sorted({round(i) for i in np.linspace(0, states - 1, min(states, most)).tolist()})
+    chosen = {round(i) for i in np.linspace(0, len(states) - 1, min(len(states), most)).tolist()}
+    if len(chosen) < len(states):
+        shown = np.logical_or.reduce([states[i].visible for i in sorted(chosen)])
+        for index, state in enumerate(states):
+            if (state.visible & ~shown).any():
+                chosen.add(index)
+                shown |= state.visible
+    return sorted(chosen)
 
 
 def _differ(a: FrameState, b: FrameState) -> bool:
