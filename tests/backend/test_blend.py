@@ -61,8 +61,8 @@ def test_linear_monotone_between_and_exact_at_both_ends(seed, began, blend_time,
     shown = BlendedMaps(a, blend_time)
     shown.show(b, began)
     times = began + np.linspace(0, 1, 17) * blend_time
-    before = None
-    for time in times[:-1].tolist():
+    before, last = None, float(np.nextafter(began + blend_time, -np.inf))  # where rounding would overshoot
+    for time in [*times[:-1].tolist(), last]:
         share = (time - began) / blend_time
         now = shown.at(time)
         assert now.frame == 2 and (now.caustics is not None) == any(some)
@@ -83,7 +83,7 @@ def test_linear_monotone_between_and_exact_at_both_ends(seed, began, blend_time,
     for time in (began + blend_time, began + blend_time * 1.5, began + 1e9):
         assert_equal(shown.at(time), b)
         assert shown.settled(time)
-    assert not shown.settled(times[8]) and shown.at(times[-1]).frame == 2
+    assert not shown.settled(times[8]) and not shown.settled(last)
 
 
 @settings(max_examples=60, deadline=None)
@@ -168,6 +168,23 @@ def test_maps_of_equal_values_do_not_hold_a_blend_up():
         shown.show(flat(8, frame), time)
         assert (shown.at(time).iim == min(frame, 8)).all() and shown.at(time).frame == frame
     assert shown.settled(1.0)
+
+
+@pytest.mark.parametrize("name", CHANNELS)
+def test_a_change_of_one_channel_is_blended(name):
+    shown = BlendedMaps(flat(1), 2.0)
+    new = replace(flat(1, 2), **{name: np.full(SHAPE, 9, np.float32)})
+    shown.show(new, 0.0)
+    assert not shown.settled(1.0)
+    assert (page_of(shown.at(1.0), name) == (page_of(flat(1), name) + 9) / 2).all()
+    assert_equal(shown.at(2.0), new)
+
+
+def test_validity_is_the_newest_even_if_it_alone_changes():
+    a = flat(1)
+    shown = BlendedMaps(a, 2.0)
+    shown.show(replace(a, valid=~a.valid), 0.0)
+    assert not shown.at(0.0).valid.any() and not shown.at(1.0).valid.any()
 
 
 def test_caustics_appear_out_of_black_and_go_into_black():

@@ -89,9 +89,7 @@ def _check_shapes(maps: LightMaps, like: LightMaps) -> None:
 
 
 def _equal(a: LightMaps, b: LightMaps) -> bool:
-    return (
-        _same(a.iim, b.iim) and _same(a.aim, b.aim) and _same(a.caustics, b.caustics) and bool(_same(a.valid, b.valid))
-    )
+    return _same(a.iim, b.iim) and _same(a.aim, b.aim) and _same(a.caustics, b.caustics) and _same(a.valid, b.valid)
 
 
 def _same(a: Float32 | Bool | None, b: Float32 | Bool | None) -> bool:
