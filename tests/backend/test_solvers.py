@@ -9,7 +9,9 @@ import scipy.sparse
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rtgi_addon.backend.final_gather.products import row_products
 from rtgi_addon.backend.final_gather.solvers import conjugate_gradients, solve_fixed_point
+from rtgi_addon.backend.parallel import Workers
 
 
 def links(rng: np.random.Generator, count: int, sky: float = 1e-3) -> np.ndarray:
@@ -93,7 +95,7 @@ def test_columns_are_independent():
     b[:, 2] *= 1e12
     together = solve_fixed_point(operator, b, tolerance=1e-6)
     np.testing.assert_allclose(together.x[:, :1], alone, rtol=1e-5)
-    assert not together.x[:, 1].any() and together.residual[1] == 0
+    assert not together.x[:, 1].any() and together.residual[0, 1] == 0
     assert together.converged.all()
 
 
@@ -172,3 +174,162 @@ def test_conjugate_gradients_of_a_semi_definite_operator():
     operator, _ = counted(laplacian)
     solution = conjugate_gradients(operator, (laplacian @ x).astype(np.float32), tolerance=1e-6)
     np.testing.assert_allclose(solution.x - solution.x.mean(axis=0), x, atol=2e-3)
+
+
+def block_diagonal(rng: np.random.Generator, sizes, albedo: float = 0.9):
+    """Groups that exchange nothing, their rows shuffled: (row products' target, weight, (n,) group)."""
+    count, width = int(sum(sizes)), 7
+    first = np.cumsum(sizes) - sizes
+    group = np.repeat(np.arange(len(sizes)), sizes)
+    target = first[group][:, None] + (rng.random((count, width)) * np.asarray(sizes)[group][:, None]).astype(int)
+    weight = rng.random((count, width)) ** 4
+    weight *= albedo / weight.sum(axis=1, keepdims=True)
+    order = rng.permutation(count)  # new row -> old row
+    number = np.argsort(order)
+    return number[target[order]].astype(np.int32), weight[order].astype(np.float32), group[order].astype(np.int32)
+
+
+def operator_of(target, weight):
+    return row_products(target, weight, len(target), Workers(1))
+
+
+def only(rows, target, weight):
+    """The operator on some rows that exchange nothing with the others."""
+    number = np.full(len(target), -1, np.int32)
+    number[rows] = np.arange(len(rows))
+    return operator_of(number[target[rows]], weight[rows])
+
+
+def same_bits(a, b):
+    assert a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), sizes=st.lists(st.integers(1, 300), min_size=1, max_size=7))
+def test_a_group_has_the_bits_it_has_alone(seed, sizes):
+    """Whatever the other groups hold, whether they are there, and whatever the labels."""
+    rng = np.random.default_rng(seed)
+    target, weight, group = block_diagonal(rng, sizes)
+    b = (rng.random((len(group), 3)) ** 6 * 10.0 ** rng.integers(-9, 9, (len(sizes), 3))[group]).astype(np.float32)
+    together = solve_fixed_point(operator_of(target, weight), b, group=group, tolerance=1e-5)
+    assert together.converged.all() and together.residual.shape == (len(sizes), 3)
+    relabelled = rng.permutation(100_000)[: len(sizes)].astype(np.int32)[group]
+    same_bits(solve_fixed_point(operator_of(target, weight), b, group=relabelled, tolerance=1e-5).x, together.x)
+    for number in range(len(sizes)):
+        rows = np.flatnonzero(group == number)
+        alone = solve_fixed_point(only(rows, target, weight), b[rows], tolerance=1e-5)
+        same_bits(alone.x, np.ascontiguousarray(together.x[rows]))
+        same_bits(alone.residual, together.residual[number : number + 1])
+        others = np.where((group == number)[:, None], b, b[::-1] * np.float32(1e5))
+        changed = solve_fixed_point(operator_of(target, weight), others, group=group, tolerance=1e-5)
+        same_bits(np.ascontiguousarray(changed.x[rows]), alone.x)
+
+
+def test_groups_that_restart_keep_their_bits_beside_groups_that_end_at_once():
+    """A corridor needs several cycles; a room beside it ends within the first. Each as if alone."""
+    rng = np.random.default_rng(8)
+    count = 700
+    near = (np.arange(count)[:, None] + np.arange(-3, 4)).clip(0, count - 1).astype(np.int32)
+    room, weight, _ = block_diagonal(rng, [200], albedo=0.5)
+    target = np.concatenate([near, room + count]).astype(np.int32)
+    weight = np.concatenate([np.full((count, 7), 0.995 / 7, np.float32), weight])
+    group = np.repeat([4, 2], [count, 200]).astype(np.int32)
+    b = rng.random((count + 200, 3)).astype(np.float32) ** 20
+    together = solve_fixed_point(operator_of(target, weight), b, group=group)
+    corridor = solve_fixed_point(operator_of(near, weight[:count]), b[:count])
+    other = solve_fixed_point(operator_of(room, weight[count:]), b[count:])
+    assert corridor.products > 26 > other.products and together.converged.all()
+    assert together.groups.tolist() == [2, 4] and together.products == corridor.products
+    same_bits(together.x[:count], corridor.x)
+    same_bits(together.x[count:], other.x)
+    same_bits(together.residual, np.concatenate([other.residual, corridor.residual]))
+
+
+def test_most_products_hold_for_each_group():
+    rng = np.random.default_rng(9)
+    target, weight, group = block_diagonal(rng, [90, 400, 30], albedo=0.999)
+    b = rng.random((520, 3)).astype(np.float32) ** 9
+    few = solve_fixed_point(operator_of(target, weight), b, group=group, max_products=5, tolerance=1e-7)
+    for number in range(3):
+        rows = np.flatnonzero(group == number)
+        alone = solve_fixed_point(only(rows, target, weight), b[rows], max_products=5, tolerance=1e-7)
+        assert alone.products <= 6 and not alone.converged.any()
+        same_bits(alone.x, np.ascontiguousarray(few.x[rows]))
+
+
+def test_rows_that_exchange_nothing_are_given_zeros_and_keep_b():
+    rng = np.random.default_rng(10)
+    target, weight, group = block_diagonal(rng, [150, 60])
+    b = rng.random((210, 3)).astype(np.float32)
+    whole = solve_fixed_point(operator_of(target, weight), b, group=group)
+    idle = group == 1
+    group[idle] = -1
+    seen = []
+
+    def operator(x):
+        seen.append(np.abs(x[idle]).max())
+        return operator_of(target, weight)(x) + idle[:, None]  # what it says about those rows is not asked for
+
+    solution = solve_fixed_point(operator, b, group=group)
+    assert max(seen) == 0 and solution.groups.tolist() == [0] and solution.converged.shape == (1, 3)
+    same_bits(solution.x[idle], b[idle])
+    same_bits(solution.x[~idle], whole.x[~idle])
+
+    def refuse(x):
+        raise AssertionError("nothing to multiply")
+
+    nothing = solve_fixed_point(refuse, b, group=np.full(210, -1, np.int32))
+    same_bits(nothing.x, b)
+    assert nothing.products == 0 and nothing.residual.shape == (0, 3) and nothing.converged.all()
+
+
+def test_one_label_for_all_is_no_label():
+    rng = np.random.default_rng(11)
+    target, weight, _ = block_diagonal(rng, [333])
+    b = rng.random((333, 3)).astype(np.float32)
+    plain = solve_fixed_point(operator_of(target, weight), b)
+    labelled = solve_fixed_point(operator_of(target, weight), b, group=np.full(333, 12345, np.int32))
+    same_bits(plain.x, labelled.x)
+    assert labelled.groups.tolist() == [12345] and plain.groups.tolist() == [0]
+
+
+def test_warm_start_of_groups_multiplies_only_for_those_with_light():
+    rng = np.random.default_rng(12)
+    target, weight, group = block_diagonal(rng, [80, 80, 80])
+    b = rng.random((240, 3)).astype(np.float32)
+    b[group == 1] = 0
+    cold = solve_fixed_point(operator_of(target, weight), b, group=group)
+    warm = solve_fixed_point(operator_of(target, weight), b, group=group, start=cold.x)
+    assert warm.products == 1 and not warm.x[group == 1].any()
+    same_bits(warm.x, cold.x)
+
+
+def test_not_finite_is_refused_in_rows_left_out_as_well():
+    b = np.ones((4, 3), np.float32)
+    b[3, 2] = np.inf
+    with pytest.raises(ValueError, match="right-hand side is not finite in column 2"):
+        solve_fixed_point(np.zeros_like, b, group=np.array([0, 0, 0, -1], np.int32))
+
+
+def test_conjugate_gradients_of_groups():
+    rng = np.random.default_rng(13)
+    sizes = [70, 1, 30]
+    group = np.repeat([5, -1, 3], sizes)
+    matrices = []
+    for size in sizes:
+        root = rng.normal(size=(size, size)) / np.sqrt(size)
+        matrices.append(scipy.sparse.csr_matrix((root @ root.T + 0.1 * np.eye(size)).astype(np.float32)))
+    matrix = scipy.sparse.block_diag(matrices).tocsr()
+    b = (rng.normal(size=(101, 3)) * np.where(group == 3, 1e6, 1)[:, None]).astype(np.float32)
+    order = rng.permutation(101)
+    together = conjugate_gradients(
+        lambda x: np.asarray(matrix[order][:, order] @ x, np.float32), b[order], group=group[order].astype(np.int32)
+    )
+    assert together.converged.all() and together.groups.tolist() == [3, 5]
+    assert not together.x[group[order] == -1].any()
+    for label, part in ((5, matrices[0]), (3, matrices[2])):
+        alone = conjugate_gradients(lambda x, m=part: np.asarray(m @ x, np.float32), b[group == label])
+        found = together.x[np.argsort(order)][group == label]
+        np.testing.assert_allclose(found, alone.x, rtol=0, atol=1e-4 * np.abs(alone.x).max())
+        exact = np.linalg.solve(part.toarray().astype(np.float64), b[group == label])
+        assert np.abs(found - exact).max() <= 2e-3 * np.abs(exact).max()
