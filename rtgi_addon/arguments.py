@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The arguments of ``rtgi bake`` and ``rtgi render``, the same for ``blender --command`` and ``python -m``.
+"""The arguments of ``rtgi bake``, ``render`` and ``report``, the same for ``blender --command`` and ``python -m``.
 
 Options of a bake are made from the ``BakeSettings`` table, so that names, ranges and defaults have one owner.
 No bpy here, and nothing is done here: text in, plain values or a :class:`BakeError` out.
@@ -40,15 +40,16 @@ class _Parser(argparse.ArgumentParser):
 
 
 def make_parser() -> argparse.ArgumentParser:
-    """The parser of the whole command; ``command`` is bake or render."""
+    """The parser of the whole command; ``command`` is bake, render or report."""
     parser = _Parser(
         prog="rtgi",
         description="Bake animated global illumination into light maps.",
         allow_abbrev=False,
     )
-    commands = parser.add_subparsers(dest="command", required=True, metavar="bake|render")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="bake|render|report")
     _add_bake(commands)
     _add_render(commands)
+    _add_report(commands)
     return parser
 
 
@@ -98,6 +99,13 @@ def _add_render(commands: Any) -> None:
     )
 
 
+def _add_report(commands: Any) -> None:
+    report = commands.add_parser("report", help="write a page of plots and pictures of a bake", allow_abbrev=False)
+    report.add_argument("maps", metavar="DIR", help="folder that rtgi bake wrote")
+    report.add_argument("--out", metavar="FILE", help="the HTML file; default: report.html in the folder of the maps")
+    _add_json(report)
+
+
 def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
     parser.add_argument("scene", nargs="?", metavar="SCENE.blend", help="default: the file that is open")
     parser.add_argument(
@@ -106,6 +114,10 @@ def _add_common(parser: argparse.ArgumentParser, out_help: str) -> None:
         help="default: the scene's range, one frame if it is static",
     )
     parser.add_argument("--out", metavar="DIR", help=out_help)
+    _add_json(parser)
+
+
+def _add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--json",
         action="store_true",

@@ -50,7 +50,7 @@ def run(argv: Sequence[str]) -> int:
 def _dispatch(arguments: argparse.Namespace | BakeError, listener: Listener) -> Summary:
     if isinstance(arguments, BakeError):
         raise arguments
-    return _bake(arguments, listener) if arguments.command == "bake" else _render(arguments, listener)
+    return {"bake": _bake, "render": _render, "report": _report}[arguments.command](arguments, listener)
 
 
 def _conclude(work: Callable[[], Summary], listener: Listener) -> int:
@@ -146,6 +146,16 @@ def _render(arguments: argparse.Namespace, listener: Listener) -> Summary:
 
     scene = named_or_open(path_of(arguments.scene))
     summary = show(ShowJob(maps, scene, frames, path_of(arguments.out), size, arguments.samples), listener)
+    return _plain(asdict(summary)), summary.in_words()
+
+
+def _report(arguments: argparse.Namespace, listener: Listener) -> Summary:
+    maps = path_of(arguments.maps)
+    assert maps is not None  # the parser asks for it
+    _need_bpy()
+    from .report import report
+
+    summary = report(maps, path_of(arguments.out), listener)
     return _plain(asdict(summary)), summary.in_words()
 
 

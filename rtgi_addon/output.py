@@ -204,17 +204,17 @@ class BakeFolder:
         write_json(self.path / "bake.json", {**self.record, "frames": ordered})
 
 
-def read_record(path: Path) -> dict[str, Any] | None:
-    """The ``bake.json`` in ``path``; None if there is none yet."""
+def read_record(path: Path, remedy: str = "delete it, or leave out --resume") -> dict[str, Any] | None:
+    """The ``bake.json`` in ``path``; None if there is none yet. ``remedy`` is told where it is not one."""
     file = path / "bake.json"
     try:
         record = json.loads(file.read_text(encoding="utf-8"))
     except FileNotFoundError:
         return None
     except (OSError, ValueError) as fault:
-        raise BakeError(f"{file}: cannot be read ({fault}); mend or delete it, or leave out --resume") from fault
+        raise BakeError(f"{file}: cannot be read ({fault}); {remedy}") from fault
     if not isinstance(record, dict) or record.get("format") != FORMAT:
-        raise BakeError(f"{file}: not written by this version of RTGI; delete it, or leave out --resume")
+        raise BakeError(f"{file}: not written by this version of RTGI; {remedy}")
     return record
 
 

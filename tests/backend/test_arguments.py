@@ -79,6 +79,9 @@ def test_every_value_out_of_range_is_told_at_once() -> None:
         ["paint", "a.blend"],
         ["render", "a.blend"],
         ["render", "a.blend", "--maps", "out", "--samples", "many"],
+        ["report"],
+        ["report", "out", "other"],
+        ["report", "out", "--frames", "1-3"],
     ],
 )
 def test_usage_errors_are_one_line_with_a_remedy(arguments: list[str]) -> None:
@@ -87,6 +90,12 @@ def test_usage_errors_are_one_line_with_a_remedy(arguments: list[str]) -> None:
     (problem,) = refused.value.problems
     assert "\n" not in problem
     assert "--help" in problem
+
+
+def test_a_report_wants_a_folder_and_takes_a_file() -> None:
+    arguments = make_parser().parse_args(["report", "maps", "--out", "page.html", "--json"])
+    assert (arguments.command, arguments.maps, arguments.out, arguments.json) == ("report", "maps", "page.html", True)
+    assert make_parser().parse_args(["report", "maps"]).out is None
 
 
 def test_help_names_every_setting(capsys: pytest.CaptureFixture[str]) -> None:
