@@ -1,129 +1,188 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Denoising of light maps: OIDN over the atlas pages, without light passing between surfaces.
+"""Denoising of light maps: OIDN over sheets of islands, without light passing between surfaces.
 
 Each surface is divided by its own mean before the filter and multiplied after it, so a bright surface beside a dark
-one on the page looks like its equal and nothing bleeds; the mean of each surface is kept. Pixels around an island
+one on its sheet looks like its equal and nothing bleeds; the mean of each surface is kept. Pixels around an island
 mirror it. In a box of islands of 16 x 16 texels with 37 % noise that leaves 9 % error; black pixels around them left
 13 %, and repeated border texels 30 %, since the filter takes such streaks for structure.
+Sheets whose texels are as they were in the last call keep their result.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..scene import Bool, Float32, Float64, Int32
-from .dilate import nearest_pixel
-from .oidn import Denoiser, require_finite
+from .oidn import Denoiser, ImageFilter, require_finite
+from .sheets import ALIGN_PX, Sheet, make_sheet, sheet_of_surfaces
 
-#: Width of the mirrored border. Wider ones meet their neighbours' and make patterns of their own.
-MIRROR_PX = 2
-#: Neutral frame around what is filtered: OIDN's error on a grey constant is below 0.4 % this far from the image's edge.
-FRAME_PX = 8
-#: OIDN pads to multiples of this with zeros, which would darken the last rows.
-ALIGN_PX = 16
 #: Surfaces have mean 1 when they are filtered; a fixed scale keeps one surface's change from touching the others.
 INPUT_SCALE = 0.3
 #: The filter may lose light (fireflies that it takes out whole); giving back more than this would only invent.
 MOST_GAIN = 2.0
+#: What the filter makes of grey is read off an image of this size: by a few per mille less or more than grey near the
+#: image's border, by 4 % in its corners (small network: 20 %), and that is taken back.
+FLAT_PX = 64
 
 
-@dataclass(frozen=True)
-class _Crop:
-    """The filtered part of one page; n texels in all, n stands for a neutral pixel."""
+@dataclass
+class _Kept:
+    """A sheet and what the last calls made of it, by the key of the call."""
 
-    source: Int32  # (h, w) texel shown by each pixel
-    texels: Int32  # (m,) those whose own pixel is here
-    pixels: Int32  # (m,) flat pixel of each
+    sheet: Sheet
+    stand_in: Int32 | None = None  # (m,) that ``sources`` are for
+    sources: Int32 | None = None  # (p,) see Sheet.sources
+    results: dict[str, tuple[Float32, Int32, Float32]] = field(default_factory=dict)  # values, stand-ins, result
 
 
 class MapDenoiser:
-    """Denoises values on the texels of one atlas; built once for it. The ``denoiser`` is the caller's to close."""
+    """Denoises values on the n texels of one atlas; built once for it. The ``denoiser`` is the caller's to close.
 
-    def __init__(self, denoiser: Denoiser, index: Int32, surface: Int32) -> None:
-        """``index`` (pages, H, W): texel of each pixel, -1 where there is none; ``surface`` (n,) of each texel."""
+    ``filtered``: texels that the last call had to filter.
+    """
+
+    def __init__(self, denoiser: Denoiser, index: Int32, surface: Int32, cluster: Int32 | None = None) -> None:
+        """``index`` (pages, H, W): texel of each pixel, -1 where there is none; ``surface`` (n,) of each texel.
+
+        Islands of one ``cluster`` (n,) may be moved together; without it each goes by itself.
+        """
+        self.filtered = 0
         self._denoiser = denoiser
-        self._index = index
         self._surface = surface
-        self._seen: Bool | None = None  # the valid texels that the pages are laid out for
+        self._counts = np.bincount(surface)
+        at = np.flatnonzero(index >= 0)
+        at = at[np.argsort(index.ravel()[at])]  # of each texel
+        page, self._row, self._col = (x.astype(np.int32) for x in np.unravel_index(at, index.shape))
+        self._cluster = (surface if cluster is None else cluster).astype(np.int64) * len(index) + page
+        self._component: Int32 | None = None  # that the sheets are for
+        self._kept: dict[bytes, _Kept] = {}  # by the surfaces on the sheet
+        self._local = np.zeros(len(surface), np.int32)  # number of each texel on its sheet
+        self._filters: dict[tuple[int, ...], ImageFilter] = {}  # by image size
+        self._flat = denoiser.denoise(np.ones((FLAT_PX, FLAT_PX, 3), np.float32), input_scale=INPUT_SCALE)
 
-    def denoise(self, values: Float32, *, valid: Bool | None = None) -> Float32:
+    def denoise(
+        self, values: Float32, *, stand_in: Int32 | None = None, component: Int32 | None = None, key: str = ""
+    ) -> Float32:
         """``values`` (n, 3) >= 0 without their noise; each surface keeps its mean (within ``MOST_GAIN``).
 
-        Texels that are not ``valid`` (n,) are not looked at; they get what the filter makes of their surroundings on
-        the surface, black where none of it is valid. Raises ValueError where a value is not finite or is negative.
+        Texels that are not their own ``stand_in`` (n,) (see ``texels.stand_ins``) are not looked at; they get what
+        the filter makes of their surroundings on the surface, black where it has no stand-in. Surfaces of different
+        ``component`` (surfaces,) share no sheet, but for small ones. Calls with one ``key`` share a memory; the
+        result does not depend on it. Raises ValueError where a value is not finite or is negative.
         """
         if values.shape != (len(self._surface), 3):
             raise ValueError(f"values of shape {values.shape}: must be ({len(self._surface)}, 3)")
-        seen = np.ones(len(values), np.bool_) if valid is None else valid
-        if self._seen is None or not np.array_equal(seen, self._seen):
-            self._see(seen)
-        require_finite(values[seen])
-        if (values[seen] < 0).any():
-            raise ValueError(f"{np.count_nonzero((values[seen] < 0).any(axis=1))} texels are negative")
-        known = np.where(seen[:, None], values, np.float32(0))
-        mean = self._means(known, seen)
-        relative = self._relative_to(mean, known)
-        shown = np.concatenate([relative, np.ones((1, 3), np.float32)])
-        filtered = np.zeros_like(relative)
-        for crop in self._crops:
-            image = self._denoiser.denoise(shown[crop.source], input_scale=INPUT_SCALE)
-            filtered[crop.texels] = image.reshape(-1, 3)[crop.pixels]
+        own = np.arange(len(values), dtype=np.int32)
+        stand_in = own if stand_in is None else stand_in
+        known = _known(values, stand_in == own)
+        self._lay_out(component)
+        self.filtered = 0
+        result = np.zeros_like(known)
+        for kept in self._kept.values():
+            texels = kept.sheet.texels
+            nearest = stand_in[texels]
+            nearest = np.where(nearest < 0, np.int32(-1), self._local[nearest])
+            result[texels] = self._on_sheet(kept, known[texels], nearest, key)
+        return result
+
+    def _lay_out(self, component: Int32 | None) -> None:
+        """Sheets for these components, with what is known of those that stay."""
+        if component is None:
+            component = np.zeros(len(self._counts), np.int32)
+        component = component[: len(self._counts)]  # surfaces after the last texel's have none
+        if self._component is not None and np.array_equal(component, self._component):
+            return
+        self._component = component.copy()
+        before, self._kept = self._kept, {}
+        sheet = sheet_of_surfaces(self._counts, component)[self._surface]
+        order = np.argsort(sheet, kind="stable").astype(np.int32)
+        for texels in np.split(order, np.flatnonzero(np.diff(sheet[order])) + 1) if len(order) else []:
+            surface = self._surface[texels]
+            name = np.unique(surface).tobytes()
+            self._kept[name] = before.get(name) or _Kept(
+                make_sheet(texels, surface, self._cluster[texels], self._row[texels], self._col[texels])
+            )
+            self._local[texels] = np.arange(len(texels), dtype=np.int32)
+        shapes = {kept.sheet.index.shape for kept in self._kept.values()}
+        for shape in [shape for shape in self._filters if shape not in shapes]:
+            self._filters.pop(shape).close()
+
+    def _on_sheet(self, kept: _Kept, values: Float32, stand_in: Int32, key: str) -> Float32:
+        """(m, 3) of one sheet; ``values`` (m, 3), zero where not valid; ``stand_in`` (m,) on the sheet."""
+        if key in kept.results:
+            old_values, old_stand_in, old_result = kept.results[key]
+            if np.array_equal(stand_in, old_stand_in) and _same_bits(values, old_values):
+                return old_result
+        if kept.sources is None or kept.stand_in is None or not np.array_equal(stand_in, kept.stand_in):
+            kept.stand_in, kept.sources = stand_in, kept.sheet.sources(stand_in)
+        result = self._filtered(kept.sheet, values, kept.sources, stand_in == np.arange(len(stand_in)))
+        self.filtered += len(values)
+        kept.results[key] = values, stand_in, result
+        return result
+
+    def _filtered(self, sheet: Sheet, values: Float32, sources: Int32, seen: Bool) -> Float32:
+        count = np.maximum(np.bincount(sheet.surface, weights=seen), 1)[:, None]
+        mean = _sums(sheet.surface, values) / count
+        relative = _relative_to(mean, values, sheet.surface)
+        opened = self._filter_of(sheet.index.shape)
+        pixels, output = opened.color.reshape(-1, 3), opened.output.reshape(-1, 3)
+        pixels[:] = 1
+        pixels[sheet.shown] = np.concatenate([relative, np.ones((1, 3), np.float32)])[sources]
+        opened.run()
+        height, width = sheet.index.shape
+        flat = self._flat[_flat_place(sheet.row, height), _flat_place(sheet.col, width)]
+        filtered = output[sheet.shown[: len(values)]] / flat
         # The mean of ``relative`` is 1.
-        gain = 1 / np.maximum(self._means(filtered, seen), 1 / MOST_GAIN)
-        return filtered * (gain * mean).astype(np.float32)[self._surface]
+        after = _sums(sheet.surface, np.where(seen[:, None], filtered, np.float32(0))) / count
+        gain = 1 / np.maximum(after, 1 / MOST_GAIN)
+        return np.asarray(filtered * (gain * mean).astype(np.float32)[sheet.surface], np.float32)
 
-    def _see(self, seen: Bool) -> None:
-        """Lay out the pages for these valid texels (n,); they change only where something moves."""
-        self._seen = seen.copy()
-        self._count = np.maximum(np.bincount(self._surface, weights=seen), 1)
-        self._crops = [_make_crop(page, self._surface, seen) for page in self._index if (page >= 0).any()]
-
-    def _means(self, values: Float32, seen: Bool) -> Float64:
-        """(surfaces, 3) mean over the valid texels of each surface."""
-        sums = [np.bincount(self._surface, weights=np.where(seen, channel, 0)) for channel in values.T]
-        return np.asarray(np.stack(sums, axis=1) / self._count[:, None], np.float64)
-
-    def _relative_to(self, mean: Float64, values: Float32) -> Float32:
-        """``values`` over their surface's mean. A channel without light shows the others' average, or 1: a colour
-        at the edge of what there is would get a tint from the filter.
-        """
-        lit = mean > 0
-        inverse = np.divide(1, mean, out=np.zeros_like(mean), where=lit)
-        relative: Float32 = (values * inverse[self._surface]).astype(np.float32)
-        dark = ~lit[self._surface]
-        if dark.any():
-            channels = 3 - dark.sum(axis=1)
-            grey = np.where(channels > 0, relative.sum(axis=1) / np.maximum(channels, 1), 1).astype(np.float32)
-            relative = np.where(dark, grey[:, None], relative)
-        return relative
+    def _filter_of(self, shape: tuple[int, ...]) -> ImageFilter:
+        if shape not in self._filters:
+            self._filters[shape] = self._denoiser.filter_of(*shape, input_scale=INPUT_SCALE)
+        return self._filters[shape]
 
 
-def _make_crop(page: Int32, surface: Int32, seen: Bool) -> _Crop:
-    rows, cols = np.flatnonzero((page >= 0).any(axis=1)), np.flatnonzero((page >= 0).any(axis=0))
-    used = page[rows[0] : rows[-1] + 1, cols[0] : cols[-1] + 1]
-    size = [-(-(side + 2 * FRAME_PX) // ALIGN_PX) * ALIGN_PX for side in used.shape]
-    index = np.full(size, -1, np.int32)
-    index[FRAME_PX : FRAME_PX + used.shape[0], FRAME_PX : FRAME_PX + used.shape[1]] = used
-    source = _mirrored(index, np.where((index >= 0) & seen[index], index, np.int32(-1)), surface)
-    pixels = np.flatnonzero(index >= 0)
-    return _Crop(np.where(source >= 0, source, np.int32(len(surface))), index.ravel()[pixels], pixels.astype(np.int32))
-
-
-def _mirrored(index: Int32, known: Int32, surface: Int32) -> Int32:
-    """(h, w) texel to show at each pixel, -1 for none. ``known``: ``index`` without the texels that are not valid.
-
-    Pixels of an island that are not known, and pixels within MIRROR_PX of one, show the texel as far on the other
-    side of the nearest known one, or that one itself where the island ends before.
+def _flat_place(at: Int32, side: int) -> Int32:
+    """Where in FLAT_PX a pixel at ``at`` of ``side`` lies: as far from the nearer end, and at the same place of the
+    filter's grid of ALIGN_PX.
     """
-    if not (known >= 0).any():
-        return known
-    rows, cols, distance = nearest_pixel(known)
-    height, width = index.shape
-    beyond_row = np.clip(2 * rows - np.arange(height)[:, None], 0, height - 1)
-    beyond_col = np.clip(2 * cols - np.arange(width)[None, :], 0, width - 1)
-    nearest, beyond = known[rows, cols], known[beyond_row, beyond_col]
-    same = (beyond >= 0) & (surface[beyond] == surface[nearest])
-    shown = np.where(index >= 0, surface[index] == surface[nearest], distance <= MIRROR_PX)
-    return np.where(shown, np.where(same, beyond, nearest), np.int32(-1))
+    half = FLAT_PX // 2
+    inside = np.where(at < half, at, half + at % ALIGN_PX)
+    return np.where((side - at <= half) & (2 * at >= side), FLAT_PX - side + at, inside)
+
+
+def _known(values: Float32, seen: Bool) -> Float32:
+    """``values`` (n, 3) where they are ``seen`` (n,), else zero; raises ValueError where those cannot be light."""
+    known = np.where(seen[:, None], values, np.float32(0))
+    if not np.isfinite(known).all():
+        require_finite(values[seen])
+    if (known < 0).any():
+        raise ValueError(f"{np.count_nonzero((known < 0).any(axis=1))} texels are negative")
+    return known
+
+
+def _same_bits(a: Float32, b: Float32) -> bool:
+    return np.array_equal(a.view(np.uint32), b.view(np.uint32))
+
+
+def _sums(surface: Int32, values: Float32) -> Float64:
+    """(k, 3) sum of ``values`` (m, 3) over each surface."""
+    return np.stack([np.bincount(surface, weights=channel) for channel in values.T], axis=1)
+
+
+def _relative_to(mean: Float64, values: Float32, surface: Int32) -> Float32:
+    """``values`` over their surface's ``mean`` (k, 3). A channel without light shows the others' average, or 1: a
+    colour at the edge of what there is would get a tint from the filter.
+    """
+    lit = mean > 0
+    inverse = np.divide(1, mean, out=np.zeros_like(mean), where=lit)
+    relative: Float32 = (values * inverse[surface]).astype(np.float32)
+    if not lit.all():
+        dark = ~lit[surface]
+        channels = 3 - dark.sum(axis=1)
+        grey = np.where(channels > 0, relative.sum(axis=1) / np.maximum(channels, 1), 1).astype(np.float32)
+        relative = np.where(dark, grey[:, None], relative)
+    return relative

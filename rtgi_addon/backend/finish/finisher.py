@@ -58,7 +58,8 @@ class Finisher:
         self._seams = SeamMatcher(scene, atlas, self._dilation, texels.surface) if settings.seams else None
         self._oidn, warning = oidn.result()
         self.warnings = [] if warning is None else [warning]
-        self._denoiser = MapDenoiser(self._oidn, texels.index, texels.surface) if self._oidn else None
+        cluster = 2 * texels.instance + texels.side
+        self._denoiser = MapDenoiser(self._oidn, texels.index, texels.surface, cluster) if self._oidn else None
 
     def close(self) -> None:
         """Give the denoiser's threads back."""
@@ -67,15 +68,25 @@ class Finisher:
             self._oidn = None
             self._denoiser = None
 
-    def denoise(self, values: Float32, stand_in: Int32) -> Float32:
+    @property
+    def filtered(self) -> int:
+        """Texels that the last :meth:`denoise` had to filter; the others' result was kept."""
+        return self._denoiser.filtered if self._denoiser else 0
+
+    def denoise(
+        self, values: Float32, stand_in: Int32, *, component: Int32 | None = None, half: bool = False
+    ) -> Float32:
         """``values`` (n, 3) filtered; texels that are not valid get what the filter makes of their surroundings.
 
-        Where there is no denoiser they are only filled.
+        ``component`` (surfaces,): surfaces of different ones exchange no light, and what changes in one leaves the
+        others' bits; None: all are one. Light of ``half`` the rays has a memory of its own.
+        Where there is no denoiser values are only filled.
         """
         if self._denoiser is None or not len(values):
             return fill(values, stand_in)
-        valid = stand_in == np.arange(len(stand_in))
-        return self._denoiser.denoise(np.maximum(values, 0), valid=valid)
+        return self._denoiser.denoise(
+            np.maximum(values, 0), stand_in=stand_in, component=component, key="half" if half else "full"
+        )
 
     def close_seams(self, values: Float32) -> Float32:
         """``values`` (n, 3) matched along the cuts through smooth surfaces, or as they are when not asked for."""

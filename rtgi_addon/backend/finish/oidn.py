@@ -20,8 +20,8 @@ from ..scene import Float32
 
 _CPU = 1  # OIDN_DEVICE_TYPE_CPU: GPUs give other bits
 _FLOAT3 = 3  # OIDN_FORMAT_FLOAT3
-#: Above this much memory OIDN cuts the image into tiles (same bits, measured). Its own default follows the machine.
 _QUALITY_FAST = 4  # OIDN_QUALITY_FAST
+#: Above this much memory OIDN cuts the image into tiles (same bits, measured). Its own default follows the machine.
 _MEMORY_MB = 2048
 _NAMES = {
     "win32": ("OpenImageDenoise.dll",),
@@ -86,6 +86,7 @@ class Denoiser:
         self.kind = kind
         self.fast = fast
         self._api = _load(library)
+        self._filters: list[ImageFilter] = []
         self._device: int | None = self._api.oidnNewDevice(_CPU)
         self._check()
         if threads > 0:
@@ -103,29 +104,40 @@ class Denoiser:
             raise OidnError(f"{library}: OIDN {self.version} has no {kind.value} filter ({error})") from error
 
     def denoise(self, image: Float32, *, input_scale: float | None = None) -> Float32:
-        """``image`` (h, w, 3) linear, >= 0, without its noise.
+        """``image`` (h, w, 3) linear, >= 0, without its noise; see :meth:`filter_of`.
 
-        ``input_scale`` brings the values near 1, where the filter was trained; None: OIDN measures the image.
         Raises ValueError for another shape and for values that are not finite, OidnError where OIDN refuses.
         """
         if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
             raise ValueError(f"an image of shape {image.shape}: must be (h, w, 3) and not empty")
-        color = np.ascontiguousarray(image, np.float32)
-        require_finite(color)
+        require_finite(np.asarray(image, np.float32))
+        with self.filter_of(image.shape[0], image.shape[1], input_scale=input_scale) as opened:
+            opened.color[:] = image
+            opened.run()
+            return opened.output
+
+    def filter_of(self, height: int, width: int, *, input_scale: float | None = None) -> ImageFilter:
+        """A filter for images of one size, the caller's to close: making one takes as long as filtering 16 x 16.
+
+        ``input_scale`` brings the values near 1, where the filter was trained; None: OIDN measures the image.
+        """
         if self._device is None:
             raise ValueError("the denoiser is closed")
-        output = np.zeros_like(color)
         handle = self._api.oidnNewFilter(self._device, self.kind.value.encode())
         self._check()
+        made = ImageFilter(self, handle, height, width)
+        self._filters.append(made)
         try:
-            self._run(handle, color, output, input_scale)
-        finally:
-            self._api.oidnReleaseFilter(handle)
-        return output
+            self._commit(made, input_scale)
+        except OidnError:
+            made.close()
+            raise
+        return made
 
-    def _run(self, handle: int, color: Float32, output: Float32, input_scale: float | None) -> None:
-        height, width = color.shape[:2]
-        for name, array in ((b"color", color), (b"output", output)):
+    def _commit(self, made: ImageFilter, input_scale: float | None) -> None:
+        handle = made.handle
+        for name, array in ((b"color", made.color), (b"output", made.output)):
+            height, width = array.shape[:2]
             self._api.oidnSetSharedFilterImage(handle, name, array.ctypes.data, _FLOAT3, width, height, 0, 0, 0)
         if self.kind is FilterKind.RT:  # the light-map filter is always hdr
             self._api.oidnSetFilterBool(handle, b"hdr", True)
@@ -136,8 +148,16 @@ class Denoiser:
         self._api.oidnSetFilterInt(handle, b"maxMemoryMB", _MEMORY_MB)
         self._api.oidnCommitFilter(handle)
         self._check()
+
+    def execute(self, handle: int) -> None:
+        """Run a filter of this device."""
         self._api.oidnExecuteFilter(handle)
         self._check()
+
+    def release(self, made: ImageFilter) -> None:
+        """Give back what OIDN holds for a filter of this device."""
+        self._filters = [other for other in self._filters if other is not made]
+        self._api.oidnReleaseFilter(made.handle)
 
     def _check(self) -> None:
         """Raise the error OIDN holds for this device, or for the thread where no device could be made."""
@@ -152,12 +172,42 @@ class Denoiser:
             raise OidnError("Open Image Denoise: no CPU device")
 
     def close(self) -> None:
-        """Give device and threads back."""
+        """Give device and threads back; filters that are still open are closed."""
         if self._device is not None:
+            for opened in list(self._filters):
+                opened.close()
             self._api.oidnReleaseDevice(self._device)
             self._device = None
 
     def __enter__(self) -> Denoiser:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()
+
+
+class ImageFilter:
+    """A filter of one image size. Fill ``color`` (h, w, 3), finite and >= 0; ``run``; read ``output``."""
+
+    def __init__(self, denoiser: Denoiser, handle: int, height: int, width: int) -> None:
+        self._denoiser: Denoiser | None = denoiser
+        self.handle = handle
+        self.color: Float32 = np.zeros((height, width, 3), np.float32)
+        self.output: Float32 = np.zeros((height, width, 3), np.float32)
+
+    def run(self) -> None:
+        """Filter ``color`` into ``output``."""
+        if self._denoiser is None:
+            raise ValueError("the filter is closed")
+        self._denoiser.execute(self.handle)
+
+    def close(self) -> None:
+        """Give back what OIDN holds for it."""
+        if self._denoiser is not None:
+            self._denoiser.release(self)
+            self._denoiser = None
+
+    def __enter__(self) -> ImageFilter:
         return self
 
     def __exit__(self, *exception: object) -> None:
