@@ -14,8 +14,8 @@ from scipy.sparse.csgraph import connected_components
 
 from ..scene import Bool, Int32
 
-#: Up to this many surfaces every pair has a count, 8 MB of them; with more only pairs that have occurred.
-DENSE_SURFACES = 1000
+#: Up to this many surfaces every pair has a count, 2 MB of them; with more only pairs that have occurred.
+DENSE_SURFACES = 512
 #: Pairs worked on at a time, so that scenes of 50 million links need no array of all their pairs.
 CHUNK_PAIRS = 1 << 21
 
@@ -131,9 +131,14 @@ class SurfaceGraph:
                 return
         self._flips = []
         linked = np.flatnonzero(self._links)
-        row, target = np.divmod(linked if self._keys is None else self._keys[linked], self._stride)
+        if self._keys is not None and 2 * len(linked) < len(self._keys):
+            self._keys, self._links = self._keys[linked], self._links[linked]
+            linked = np.arange(len(linked))
+        keys = linked if self._keys is None else self._keys[linked]
+        row = keys // self._stride
+        target = keys - row * self._stride - 1
         shape = (self.surface_count, self.surface_count)
-        graph = sparse.coo_matrix((np.ones(len(row), np.int8), (row, target - 1)), shape=shape)
+        graph = sparse.coo_matrix((np.ones(len(row), np.int8), (row, target)), shape=shape)
         count, label = connected_components(graph, directed=False)
         first = np.full(count, self.surface_count)
         np.minimum.at(first, label, np.arange(self.surface_count))
