@@ -17,6 +17,7 @@ from ..backend.scene import Bool, Float32, Float64, FrameState, Light, Material
 from ..source import SourceScene
 from . import lights, materials, world
 from .as_rendered import read_as_rendered
+from .lobes import Lobes
 from .meshes import loop_normals, positions
 from .placed import Placed, placed_meshes
 from .variants import Finder
@@ -31,6 +32,7 @@ class Reading:
     vertices: dict[int, Float32] = field(default_factory=dict)
     corner_normals: dict[int, Float32] = field(default_factory=dict)
     lamps: tuple[Light, ...] = ()
+    lobes: dict[int, Lobes] = field(default_factory=dict)
 
 
 def frame_state(source: SourceScene, frame: int, *, constants: Sequence[Material] | None = None) -> FrameState:
@@ -52,7 +54,7 @@ def frame_state(source: SourceScene, frame: int, *, constants: Sequence[Material
         world=sky,
         vertices=reading.vertices,
         corner_normals=reading.corner_normals,
-        materials=None if constants is None else materials.animated_constants(source, constants),
+        materials=None if constants is None else materials.animated_constants(source, constants, reading.lobes),
     )
 
 
@@ -74,6 +76,7 @@ def _read(depsgraph: bpy.types.Depsgraph, source: SourceScene, frame: int) -> Re
         if instance.deforming and instance.mesh not in reading.vertices:
             _read_deformed(placed, source, instance.mesh, frame, reading)
     reading.lamps = lights.lights_of(depsgraph, _told_already)
+    reading.lobes = materials.animated_lobes(source, depsgraph)
     return reading
 
 

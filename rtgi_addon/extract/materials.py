@@ -18,6 +18,7 @@ from ..backend.progress import Report
 from ..backend.scene import Float32, Material
 from ..source import Layout, SourceScene
 from . import nodes
+from .as_rendered import read_as_rendered
 from .lobes import OUTPUT, Lobes, read_lobes
 from .material_maps import bake_mesh, carried_of, tell_instances, with_means
 from .palette import evaluate_constants
@@ -40,7 +41,9 @@ def evaluate_materials(
     warnings: dict[str, None] = {}  # keeps order
     materials = [_find(name) for name in source.material_names]
     _require_images(materials)
-    lobes = [Lobes() if m is None else read_lobes(m) for m in materials]
+    lobes = read_as_rendered(
+        bpy.context.scene, bpy.context.view_layer, lambda depsgraph: _lobes_of(materials, depsgraph)
+    )
     for material, lobe in zip(materials, lobes, strict=True):
         warnings.update({f"material {material.name}: {note}": None for note in lobe.notes if material is not None})
     varies = np.array([m is not None and _varies(m) for m in materials], np.bool_)
@@ -62,20 +65,31 @@ def evaluate_materials(
     return Appearance(constants, albedo, emission, tuple(warnings))
 
 
-def animated_constants(source: SourceScene, constants: Sequence[Material]) -> tuple[Material, ...] | None:
-    """``constants`` with the animated ones evaluated at the current frame; None where none is."""
+def animated_lobes(source: SourceScene, depsgraph: bpy.types.Depsgraph) -> dict[int, Lobes]:
+    """Of the materials that :func:`animated_constants` evaluates, by their number; animation is ``depsgraph``'s."""
     materials = [_find(name) for name in source.material_names]
     moving = [i for i, m in enumerate(materials) if nodes.is_time_dependent(m) and not _varies(m)]
-    if not moving:
+    return dict(zip(moving, _lobes_of([materials[i] for i in moving], depsgraph), strict=True))
+
+
+def animated_constants(
+    source: SourceScene, constants: Sequence[Material], lobes: dict[int, Lobes]
+) -> tuple[Material, ...] | None:
+    """``constants`` with the animated ones, those of ``lobes``, evaluated at the current frame; None where none is."""
+    if not lobes:
         return None
-    some = [materials[i] for i in moving]
-    lobes = [read_lobes(m) for m in some]
-    names = [source.material_names[i] for i in moving]
-    new = evaluate_constants(names, some, lobes, np.zeros(len(some), np.bool_), {})
+    names = [source.material_names[i] for i in lobes]
+    some = [_find(name) for name in names]
+    new = evaluate_constants(names, some, list(lobes.values()), np.zeros(len(some), np.bool_), {})
     out = list(constants)
-    for index, material in zip(moving, new, strict=True):
+    for index, material in zip(lobes, new, strict=True):
         out[index] = material
     return tuple(out)
+
+
+def _lobes_of(materials: Sequence[bpy.types.Material | None], depsgraph: bpy.types.Depsgraph) -> list[Lobes]:
+    """Read from evaluated node trees: of what only renders show, the file's own keep the values of another frame."""
+    return [Lobes() if m is None else read_lobes(m.evaluated_get(depsgraph)) for m in materials]
 
 
 def _find(name: str | None) -> bpy.types.Material | None:

@@ -205,6 +205,45 @@ def test_animated_material_constants(add_cube: AddObject) -> None:
     assert frame_state(still, 3, constants=plain).materials is None
 
 
+@pytest.mark.parametrize("in_viewport", [True, False])
+@pytest.mark.parametrize(
+    ("socket", "values", "read", "expected"),
+    [
+        ("Base Color", ((0, 0, 0, 1), (1, 1, 1, 1)), lambda m: m.albedo[0], (0.04, 0.52, 1.0)),
+        ("Emission Strength", (0.0, 6.0), lambda m: m.emission[0], (0.0, 3.0, 6.0)),
+        ("Metallic", (0.0, 1.0), lambda m: m.specular[0], (0.0, 0.4, 0.8)),
+        ("Transmission Weight", (0.0, 1.0), lambda m: m.transmission[0], (0.0, 0.45, 0.9)),
+        ("Alpha", (1.0, 0.25), lambda m: m.opacity, (1.0, 0.625, 0.25)),
+    ],
+)
+def test_every_animated_input_arrives_in_every_frame(
+    add_cube: AddObject,
+    socket: str,
+    values: tuple,
+    read: Callable[..., float],
+    expected: tuple[float, ...],
+    in_viewport: bool,
+) -> None:
+    """Also of an object that only renders show, whose materials Blender does not animate in the open file."""
+    material = bpy.data.materials.new("Changing")
+    if bpy.app.version < (5, 0, 0):
+        material.use_nodes = True
+    shader = next(n for n in material.node_tree.nodes if n.bl_idname == "ShaderNodeBsdfPrincipled")
+    shader.inputs["Roughness"].default_value = 0.0
+    shader.inputs["Emission Color"].default_value = (1, 1, 1, 1)
+    animate(shader.inputs[socket], "default_value", (1, values[0]), (3, values[1]))
+    add_cube(material=material).hide_viewport = not in_viewport
+    set_world((1, 1, 1), 1.0)
+    source = extract_source([1, 2, 3], silent)
+    layout = Layout(np.zeros((12, 3, 2), np.float32), np.zeros(12, np.int32), (1.0, 1.0))
+    bpy.context.scene.frame_set(1)
+    constants = evaluate_materials(source, [layout], [(4, 4)], silent).materials
+    assert read(constants[0]) == pytest.approx(expected[0], abs=0.01)
+    for frame, value in zip((1, 2, 3), expected, strict=True):
+        bpy.context.scene.frame_set(frame)
+        assert read(frame_state(source, frame, constants=constants).materials[0]) == pytest.approx(value, abs=0.01)
+
+
 def evaluate_materials_of_grey(source: SourceScene, layout: Layout) -> tuple:
     set_world((1, 1, 1), 1.0)
     lit = extract_source([bpy.context.scene.frame_current], silent)

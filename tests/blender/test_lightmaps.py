@@ -288,6 +288,91 @@ def test_standins_follow_the_frames(picture, add_mesh, tmp_path):
     assert blinking.hide_render
 
 
+def test_variants_show_their_own_rectangles_in_their_frames(picture, add_mesh, tmp_path):
+    """An array that grows from one square to two and back, while it moves; and frames between those that are baked."""
+    scene, material = bpy.context.scene, white()
+    growing = place(add_mesh("Growing", SQUARE, [(0, 1, 2, 3)], material=material), -4, 4)
+    array_modifier(growing)
+    for frame, count in ((1, 1), (3, 2), (7, 1)):
+        growing.modifiers["Array"].count = count
+        growing.modifiers["Array"].keyframe_insert("count", frame=frame)
+    for frame, y in ((1, 4.0), (7, -2.0)):
+        growing.location.y = y
+        growing.keyframe_insert("location", frame=frame)
+    for curve in curves_of(growing):
+        for key in curve.keyframe_points:
+            key.interpolation = "CONSTANT" if "modifiers" in curve.data_path else "LINEAR"
+    bending = place(add_mesh("Bending", np.array(SQUARE) * 0.5, [(0, 1, 2, 3)], material=material), -6, -4)
+    bending.shape_key_add(name="Basis")
+    key = bending.shape_key_add(name="Aside")
+    key.data.foreach_set("co", (np.array(SQUARE) * 0.5 + [8, 0, 0]).ravel())
+    array_modifier(bending)
+    for frame, value, count in ((1, 0.0, 1), (3, 0.25, 2), (7, 0.75, 1)):
+        key.value, bending.modifiers["Array"].count = value, count
+        key.keyframe_insert("value", frame=frame)
+        bending.modifiers["Array"].keyframe_insert("count", frame=frame)
+    for curve in [*curves_of(bending), *curves_of(bending.data.shape_keys)]:
+        for point in curve.keyframe_points:
+            point.interpolation = "CONSTANT" if "modifiers" in curve.data_path else "LINEAR"
+
+    before = dump_file()
+    source, applied = light(tmp_path, (1, 3, 5, 7))
+    assert [i.name for i in source.instances] == [
+        *(f"{name} [frames {frames}]" for name in ("Growing", "Bending") for frames in ("1, 7", "3 to 5"))
+    ]
+    assert applied.standins == 4
+    for frame, variant, y, x in (
+        (1, "1, 7", 4.0, -6.0),
+        (2, "1, 7", 4.0, -6.0),  # between two looks the earlier holds, where it was
+        (3, "3 to 5", 2.0, -4.0),
+        (4, "3 to 5", 1.0, -3.0),  # within one look it moves on
+        (5, "3 to 5", 0.0, -2.0),
+        (6, "3 to 5", 0.0, -2.0),
+        (7, "1, 7", -2.0, 0.0),
+        (9, "1, 7", -2.0, 0.0),
+    ):
+        scene.frame_set(frame)
+        drawn = picture(width=192, height=192, span=16.0)
+        expect(drawn, source, {f"Growing [frames {variant}]": (-4, y), f"Bending [frames {variant}]": (x, -4)})
+        second = drawn[*pixel_of(-4 + 1.6 + 0.2, y), 0]  # of the array's squares
+        assert (second > 0) == (variant == "3 to 5"), frame
+        in_viewport = {i.object.name for i in bpy.context.evaluated_depsgraph_get().object_instances}
+        shown = {f"RTGI {name} [frames {variant}]" for name in ("Growing", "Bending")}
+        assert {name for name in in_viewport if name.startswith(("RTGI", "Growing", "Bending"))} == shown
+    scene.frame_set(1)
+    remove_lightmaps()
+    after = dump_file()
+    for part in before:
+        assert after[part] == before[part], part
+    assert not any(obj.hide_viewport or obj.hide_render for obj in (growing, bending))
+    assert list(bpy.data.collections) == []
+
+
+def test_files_of_variants_hold_their_own_frames_alone(add_mesh, tmp_path):
+    """Vertices of a look are on disk once for each frame from its first to its last, not for all frames."""
+    obj = add_mesh("Melt", SQUARE, [(0, 1, 2, 3)], material=white())
+    obj.shape_key_add(name="Basis")
+    key = obj.shape_key_add(name="Up")
+    key.data[0].co.z = 1
+    array_modifier(obj)
+    for frame, value in ((1, 0.0), (8, 1.0)):
+        key.value = value
+        key.keyframe_insert("value", frame=frame)
+    for frame, count in ((1, 1), (5, 2), (6, 1)):
+        obj.modifiers["Array"].count = count
+        obj.modifiers["Array"].keyframe_insert("count", frame=frame)
+    for curve in curves_of(obj):
+        for point in curve.keyframe_points:
+            point.interpolation = "CONSTANT"
+    source, _applied = light(tmp_path, tuple(range(1, 9)))
+    assert [(i.name, i.deforming) for i in source.instances] == [
+        ("Melt [frames 1 to 4, 6 to 8]", True),
+        ("Melt [frame 5]", False),
+    ]
+    assert [path.stat().st_size for path in sorted(tmp_path.glob("*.pc2"))] == [32 + 8 * 4 * 12]
+    remove_lightmaps()
+
+
 def curves_of(block: bpy.types.ID):
     from rtgi_addon.lightmap_nodes import animation_curves
 

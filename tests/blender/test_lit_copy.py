@@ -65,3 +65,35 @@ def test_the_copy_s_sky_is_baked_again(under_sky: Path, tmp_path: Path) -> None:
     first, again = (read_page(tmp_path / folder / "iim.p0.0001.exr")[0] for folder in ("maps", "again"))
     assert first.max() == pytest.approx(np.pi * SKY_W_M2_SR, rel=0.03)
     np.testing.assert_array_equal(first, again)
+
+
+def test_the_copy_plays_an_object_whose_faces_change(under_sky: Path, tmp_path: Path) -> None:
+    """Tiles on bare ground, one more in each frame: all that is there shows the sky's light, the rest nothing.
+
+    Nothing of the extension runs when it is opened. Baked again it gives the same maps.
+    """
+    floor = bpy.data.objects["Floor"]
+    floor.scale, floor.location = (0.2, 0.2, 1), (-0.75, 0, 0)  # tiles of 0.8 m along x
+    tiles = floor.modifiers.new("Tiles", "ARRAY")
+    tiles.relative_offset_displace = (1, 0, 0)
+    for frame in (1, 3):
+        tiles.count = frame
+        tiles.keyframe_insert("count", frame=frame)
+    bpy.ops.wm.save_mainfile()
+    lit, out = tmp_path / "lit.blend", tmp_path / "maps"
+    bake(under_sky, out, "--frames", "1-3", "--save-blend", str(lit))
+    bpy.ops.wm.open_mainfile(filepath=str(lit))
+    scene = bpy.context.scene
+    draw = eevee_from_above(scene, tmp_path)
+    right = {frame: -0.75 + 0.4 + 0.8 * (frame - 1) for frame in (1, 2, 3)}  # edge of the last tile
+    for frame in (3, 1, 2):
+        scene.frame_set(frame)
+        row = draw(width=16, height=16, span=3.2)[8]
+        x = (np.arange(16) + 0.5) * 0.2 - 1.6
+        there = (x > -1.15) & (x < right[frame])
+        np.testing.assert_allclose(row[there], ALBEDO * SKY_W_M2_SR, rtol=0.04, err_msg=str(frame))
+        np.testing.assert_allclose(row[~there], SKY_W_M2_SR, rtol=1e-3, err_msg=str(frame))  # the sky below
+    bake(lit, tmp_path / "again", "--frames", "1-3")
+    for frame in (1, 2, 3):
+        first, again = (read_page(folder / f"iim.p0.{frame:04d}.exr")[0] for folder in (out, tmp_path / "again"))
+        np.testing.assert_array_equal(first, again)

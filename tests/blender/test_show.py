@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 
@@ -78,6 +79,38 @@ def test_pictures_show_the_maps_and_the_scene_stays_unlit(scene_file: Path, maps
 
 def page(irradiance: float) -> tuple[np.ndarray, np.ndarray]:
     return np.full((SIZE_PX, SIZE_PX, 3), irradiance, np.float32), np.ones((SIZE_PX, SIZE_PX), np.bool_)
+
+
+def test_faces_that_change_show_the_maps_of_their_frames(scene_file: Path, tmp_path: Path) -> None:
+    """A sheet over the floor of one square in frame 1 and of two in frame 2: each look has light of its own."""
+    sheet = bpy.data.objects["Floor"].copy()
+    sheet.data = sheet.data.copy()
+    sheet.name, sheet.location.z = "Sheet", 0.5
+    bpy.context.scene.collection.objects.link(sheet)
+    array = sheet.modifiers.new("Array", "ARRAY")
+    for frame in (1, 2):
+        array.count = frame
+        array.keyframe_insert("count", frame=frame)
+    bpy.ops.wm.save_mainfile()
+    maps, drawn = tmp_path / "maps", tmp_path / "drawn"
+    bake = ["bake", str(scene_file), "--out", str(maps), "--resolution", str(SIZE_PX), "--quality", "draft"]
+    assert run([*bake, "--frames", "1-2"]) == 0
+    values = {"Sheet [frame 1]": 0.2, "Sheet [frame 2]": 0.6}
+    pixels, valid = page(0.0)
+    for entry in json.loads((maps / "bake.json").read_text())["atlas"]["objects"]:
+        x, y, width, height = entry["rectangle"]
+        pixels[y : y + height, x : x + width] = np.pi * values.get(entry["name"], 0.0)
+    for frame in (1, 2):
+        write_page(maps / map_name("iim", 0, frame), pixels, valid)
+    flags = ["--maps", str(maps), "--resolution", "32x24", "--samples", "1", "--out", str(drawn)]
+    assert run(["render", str(scene_file), *flags]) == 0
+    first, second = (read_picture(drawn / f"preview.000{frame}.png")[12, 16, 0] for frame in (1, 2))
+    # Albedo 0.8; the lamp gives both the same. In linear light, which the pictures do not hold.
+    assert linear(second) - linear(first) == pytest.approx(0.8 * 0.4, abs=0.02)
+
+
+def linear(srgb: float) -> float:
+    return ((srgb + 0.055) / 1.055) ** 2.4
 
 
 def test_a_reopened_bake_has_the_atlas_it_was_made_with(scene_file: Path, maps: Path) -> None:
