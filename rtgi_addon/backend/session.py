@@ -15,25 +15,21 @@ from types import TracebackType
 import numpy as np
 
 from .final_gather import radiosity
-from .final_gather.bright import bright_targets
-from .final_gather.gather import GatherRays
-from .final_gather.links import Links, trace_links
-from .final_gather.radiosity import Illumination
+from .final_gather.bright import BrightTargets, bright_targets, bright_weight
+from .final_gather.lighting import Light, Lighting
 from .finish.finisher import Finisher, OidnOpening, fill
 from .lamps import emission
 from .lamps.direct import direct_irradiance, make_shadows
-from .lamps.sky import Sky, make_sky
 from .limits import bounded_scene, bounded_state
 from .parallel import Workers
 from .photon import caustics, photon_map, photons
-from .photon.scatter import Surfaces, diffuse_shares, make_surfaces
+from .placed import PlacedScene
 from .progress import Report, silent
-from .scene import Atlas, Bool, Float32, FrameState, Int32, LightMaps, Scene
-from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts
+from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
+from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts, Selection
 from .stats import FrameStats
 from .surface.geometry import Geometry
-from .surface.texels import TexelFrame, make_texels, place_texels, texel_colours
-from .surface.tracing import EmbreeTracer
+from .surface.texels import Texels
 
 #: Each frame has so many stages to report.
 STAGE_COUNT = 6
@@ -41,6 +37,8 @@ STAGE_COUNT = 6
 PILOT = SampleCounts(16, 16)
 #: A frame that does not meet its target with so many rays a texel is given as it is, with a warning.
 MOST_RAYS = 4096
+#: Rays of either kind that a try may have: each half again, or a third, more than the last.
+STEPS = tuple(n << k for k in range(3, 10) for n in (2, 3)) + (MOST_RAYS // 2,)
 #: Denoised error falls about with the cube root of the rays (measured: 3.0 % at 32, 1.5 % at 256).
 ERROR_EXPONENT = 3.0
 #: Least and most that one more try multiplies the rays by.
@@ -54,26 +52,13 @@ class FrameResult:
 
 
 @dataclass(frozen=True)
-class _Placed:
-    """One frame's scene, ready to be lit; n texels, m targets (texels and sky patches)."""
-
-    state: FrameState
-    frame: TexelFrame
-    surfaces: Surfaces
-    albedo: Float32  # (n, 3) share of the light arriving that leaves diffusely: albedo × opacity
-    emitted: Float32  # (m, 3) radiosity that targets send of themselves, W/m²
-    sky: Sky | None
-
-
-@dataclass(frozen=True)
 class _Lit:
     """One frame's light on the texels, before seams are closed."""
 
     frame: int
     samples: SampleCounts
-    aim: Float32  # (n, 3) W/m²
+    light: Light
     iim: Float32  # (n, 3) W/m², denoised
-    stand_in: Int32  # (n,) see Links
     estimated_error: float | None
 
 
@@ -87,25 +72,39 @@ class Session:
         settings: BakeSettings,
         state: FrameState,
         *,
+        guide: Sequence[FrameState] = (),
         oidn_paths: Sequence[Path] = (),
         report: Report = silent,
     ) -> None:
-        """``state`` is the first frame to bake. ``oidn_paths``: where Open Image Denoise's library may lie.
+        """``state`` is the first frame to bake. ``guide``: frames spread over the animation, whose light tells where
+        gather rays are aimed in all of them; default: the first alone. ``oidn_paths``: where Open Image Denoise's
+        library may lie.
 
+        A frame's maps hang on these and on its own state, never on which frames were lit before it.
         Raises BakeError when the settings ask for what this machine does not have.
         """
         scene, self._bounded = bounded_scene(scene)
-        state, _ = bounded_state(state, scene)
+        states = [bounded_state(s, scene)[0] for s in (state, *guide)]
         self.scene, self.atlas, self.settings = scene, atlas, settings
         self._report = report
         oidn = OidnOpening(settings, oidn_paths)
         self._workers = Workers(settings.threads)
-        self.geometry = Geometry(scene, state)
-        self._tracer = EmbreeTracer(scene, self.geometry, state, self._workers)
-        self.texels = make_texels(scene, atlas, self.geometry)
-        self._bounds = emission.make_bounds(self.geometry)
+        self._placed = PlacedScene(scene, atlas, states[0], states[1:], self._workers)
+        self._bounds = emission.make_bounds(self._placed.geometry)
         self._sides = sending_sides(scene, atlas)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
+        # The first frame's state comes last, so that it need not be placed again.
+        self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers)
+
+    @property
+    def texels(self) -> Texels:
+        """The atlas pixels that are surface; the same in all frames."""
+        return self._placed.texels
+
+    @property
+    def geometry(self) -> Geometry:
+        """All triangles as they stand in the frame last lit."""
+        return self._placed.geometry
 
     def close(self) -> None:
         """Give threads and the denoiser back."""
@@ -122,27 +121,25 @@ class Session:
 
     def advance(self, state: FrameState) -> FrameResult:
         """Light the frame ``state``."""
-        stats = FrameStats(texels_updated=self.texels.count, surfaces_updated=self.texels.surface_count)
-        state, changed = bounded_state(state, self.scene)
-        stats.warnings += dict.fromkeys([*self._bounded, *changed])
+        stats = FrameStats()
+        state, bounded = bounded_state(state, self.scene)
+        stats.warnings += dict.fromkeys([*self._bounded, *bounded])
         with stats.stage("place"):
-            placed = self._place(state)
+            change = self._placed.follow(state)
+            if self.settings.selection is Selection.OFF:
+                self._lighting.forget()
+            self._lighting.follow(self._placed, change, stats)
         self._report("place", 1, STAGE_COUNT)
-        with stats.stage("direct"):
-            direct = self._direct(placed, stats)
-        self._report("direct", 2, STAGE_COUNT)
-        with stats.stage("caustics"):
-            caustic = self._caustics(placed, stats)
-        self._report("caustics", 3, STAGE_COUNT)
-        outside = direct if caustic is None else direct + caustic
-        lit = self._illuminate(placed, outside, self._first_samples(), stats)
+        outside, caustic = self._outside(stats)
+        lit = self._illuminate(outside, self._first_samples(), stats)
         while (more := self._more_samples(lit, stats)) is not None:
-            lit = self._illuminate(placed, outside, more, stats)
+            lit = self._illuminate(outside, more, stats)
         with stats.stage("seams"):
             iim = self._finisher.close_seams(lit.iim)
         with stats.stage("pages"):
-            maps = self._pages(placed, lit, iim, caustic)
+            maps = self._pages(lit, iim, caustic)
         self._report("pages", STAGE_COUNT, STAGE_COUNT)
+        self._count(lit.light.updated, stats)
         stats.estimated_error = lit.estimated_error
         stats.warnings += self._finisher.warnings
         return FrameResult(maps, stats)
@@ -162,48 +159,61 @@ class Session:
             )
             return None
         growth = np.clip((error / target) ** ERROR_EXPONENT, *GROWTH)
-        each = min(MOST_RAYS // 2, int(np.ceil(lit.samples.cosine * growth / 8)) * 8)
+        # In steps, so that the next frame most likely asks for the same rays and finds them traced.
+        each = next(step for step in STEPS if step >= min(lit.samples.cosine * growth, STEPS[-1]))
         return SampleCounts(each, each)
 
-    def _illuminate(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> _Lit:
+    def _illuminate(self, outside: Float32, samples: SampleCounts, stats: FrameStats) -> _Lit:
         """Links with ``samples``, the light they bring, and how far it may be off."""
+        placed, lighting = self._placed, self._lighting
         with stats.stage("links"):
-            links = self._links(placed, outside, samples, stats)
+            links = lighting.links(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
         with stats.stage("aim"):
-            light = self._light(placed, outside, links, stats)
+            light = lighting.light(placed, links, samples, outside, self._photon_aim(outside, stats))
         self._report("aim", 5, STAGE_COUNT)
         with stats.stage("denoise"):
-            end = self._finisher
-            half = radiosity.gather(links, light.aim, placed.albedo, placed.emitted, from_half=True)
-            iim = end.denoise(light.iim, links.stand_in)
-            estimate = noise_estimate(iim, end.denoise(half, links.stand_in))
-        return _Lit(placed.state.frame, samples, light.aim, iim, links.stand_in, estimate)
+            iim = self._finisher.denoise(light.iim, light.stand_in)
+            estimate = noise_estimate(iim, self._finisher.denoise(light.half, light.stand_in))
+        return _Lit(placed.state.frame, samples, light, iim, estimate)
+
+    def _count(self, updated: Bool, stats: FrameStats) -> None:
+        """How many texels and surfaces got their light anew; ``updated`` (n,)."""
+        texels = self.texels
+        stats.texels_updated = int(np.count_nonzero(updated))
+        stats.texels_kept = texels.count - stats.texels_updated
+        stats.surfaces_updated = len(np.unique(texels.surface[updated]))
+        stats.surfaces_kept = texels.surface_count - stats.surfaces_updated
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
-    def _place(self, state: FrameState) -> _Placed:
-        changed = self.geometry.update(state)
-        self._tracer.update(state, changed)
-        self._bounds = emission.grown_bounds(self._bounds, self.geometry)
-        frame = place_texels(self.texels, self.geometry)
-        materials = state.materials or self.scene.materials
-        albedo, glow = texel_colours(self.texels, self.scene, self.geometry, materials)
-        surfaces = make_surfaces(self.geometry, self.texels, albedo, materials)
-        sky = make_sky(state.world)
-        emitted = glow * np.float32(np.pi)
-        if sky is not None:
-            emitted = np.concatenate([emitted, sky.radiance * np.float32(np.pi)])
-        return _Placed(state, frame, surfaces, diffuse_shares(surfaces, self.texels.triangle), emitted, sky)
+    def _guide(self, states: Sequence[FrameState]) -> BrightTargets:
+        """Where gather rays are aimed: at what shines in any of ``states``."""
+        placed, weights = self._placed, []
+        for state in reversed(states):
+            placed.follow(state)
+            outside, _ = self._outside(FrameStats())
+            known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
+            weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
+        return bright_targets(weights)
 
-    def _direct(self, placed: _Placed, stats: FrameStats) -> Float32:
+    def _outside(self, stats: FrameStats) -> tuple[Float32, Float32 | None]:
+        """((n, 3) all light that does not come by links, (n, 3) of it caustics or None)."""
+        with stats.stage("direct"):
+            direct = self._direct(stats)
+        self._report("direct", 2, STAGE_COUNT)
+        with stats.stage("caustics"):
+            caustic = self._caustics(stats)
+        self._report("caustics", 3, STAGE_COUNT)
+        return (direct if caustic is None else direct + caustic), caustic
+
+    def _direct(self, stats: FrameStats) -> Float32:
         """(n, 3) from lamps, by shadow rays; by photons when the settings say so."""
+        placed = self._placed
         if self.settings.aim_direct is AimDirect.PHOTONS:
-            paths = self._photons(placed, stats)
-            hits = photon_map.direct_hits(paths) & photon_map.lamp_hits(paths)
-            return self._density(paths, hits, placed)
-        materials = placed.state.materials or self.scene.materials
-        shadows = make_shadows(self._tracer, self.geometry, materials)
+            paths = self._photons(stats)
+            return self._density(paths, photon_map.direct_hits(paths) & photon_map.lamp_hits(paths))
+        shadows = make_shadows(placed.tracer, placed.geometry, placed.materials)
         direct, rays = direct_irradiance(
             placed.state.lights, placed.frame, shadows, self._workers,
             samples=self.settings.direct_samples, seed=self.settings.seed,
@@ -211,17 +221,17 @@ class Session:
         stats.rays += rays
         return direct
 
-    def _caustics(self, placed: _Placed, stats: FrameStats) -> Float32 | None:
+    def _caustics(self, stats: FrameStats) -> Float32 | None:
         """(n, 3) from lamps by way of mirrors and glass; None where the scene has none, or they are not asked for."""
         if self.settings.caustics is Caustics.OFF:
             return None
-        materials = placed.state.materials or self.scene.materials
-        generators = caustics.find_generators(self.scene, placed.state, self.geometry, materials)
+        placed = self._placed
+        generators = caustics.find_generators(self.scene, placed.state, self.geometry, placed.materials)
         sources = caustics.caustic_sources(placed.state, self.geometry, self._bounds, generators)
         if not sources:
             return np.zeros_like(placed.albedo) if self.settings.caustics is Caustics.ON else None
         paths, book = caustics.trace_caustics(
-            sources, photons=self.settings.photons, surfaces=placed.surfaces, tracer=self._tracer,
+            sources, photons=self.settings.photons, surfaces=placed.surfaces, tracer=self._placed.tracer,
             workers=self._workers, max_bounces=self.settings.max_specular + 1, seed=self.settings.seed,
         )  # fmt: skip
         stats.rays += book.rays
@@ -229,53 +239,40 @@ class Session:
         k = self.settings.nearest_photons
         return caustics.caustic_irradiance(paths, self.texels, placed.frame, self._workers, k=k)
 
-    def _links(self, placed: _Placed, outside: Float32, samples: SampleCounts, stats: FrameStats) -> Links:
-        known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
-        bright = bright_targets(known, placed.frame.area, placed.sky, self.geometry.extent)
-        tracer = GatherRays(
-            self.texels, placed.frame, self.geometry, placed.surfaces, self._tracer, placed.sky, bright, samples,
-            max_specular=self.settings.max_specular, seed=self.settings.seed,
-        )  # fmt: skip
-        links = trace_links(tracer, self.texels, len(placed.emitted), samples, self._workers)
-        stats.rays += links.rays
-        stats.links_traced += links.rays
-        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
-        return links
-
-    def _light(self, placed: _Placed, outside: Float32, links: Links, stats: FrameStats) -> Illumination:
+    def _photon_aim(self, outside: Float32, stats: FrameStats) -> Float32 | None:
+        """(n, 3) all light as photons tell it; None where radiosity's fixed point does."""
         if self.settings.aim_bounced is not AimBounced.PHOTONS:
-            return radiosity.solve(links, outside, placed.albedo, placed.emitted)
-        paths = self._photons(placed, stats)
+            return None
+        paths = self._photons(stats)
         # Lamps' light is in `outside` until it has bounced diffusely; all of sky's and emissive meshes' is here.
-        hits = photon_map.bounced_hits(paths) | ~photon_map.lamp_hits(paths)
-        aim = outside + self._density(paths, hits, placed)
-        return Illumination(aim, radiosity.gather(links, aim, placed.albedo, placed.emitted), 1, 0.0)
+        return outside + self._density(paths, photon_map.bounced_hits(paths) | ~photon_map.lamp_hits(paths))
 
-    def _photons(self, placed: _Placed, stats: FrameStats) -> photons.PhotonPaths:
+    def _photons(self, stats: FrameStats) -> photons.PhotonPaths:
+        placed = self._placed
         sources = emission.make_sources(self.scene, placed.state, self.geometry, self._bounds, sides=self._sides)
         counts = emission.photon_counts(sources, self.settings.photons)
         light, index = emission.all_photons(counts)
         paths, book = photons.trace_photons(
-            sources, counts, light, index, surfaces=placed.surfaces, tracer=self._tracer, workers=self._workers,
+            sources, counts, light, index, surfaces=placed.surfaces, tracer=self._placed.tracer, workers=self._workers,
             max_bounces=self.settings.max_bounces, seed=self.settings.seed,
         )  # fmt: skip
         stats.rays += book.rays
         stats.photons_traced += len(paths.light)
         return paths
 
-    def _density(self, paths: photons.PhotonPaths, hits: Bool, placed: _Placed) -> Float32:
+    def _density(self, paths: photons.PhotonPaths, hits: Bool) -> Float32:
         found = photon_map.make_photon_map(paths, hits)
         k = self.settings.nearest_photons
-        return photon_map.photon_irradiance(found, self.texels, placed.frame, self._workers, k=k)
+        return photon_map.photon_irradiance(found, self.texels, self._placed.frame, self._workers, k=k)
 
-    def _pages(self, placed: _Placed, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
+    def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end = self._finisher
         return LightMaps(
-            frame=placed.state.frame,
+            frame=lit.frame,
             iim=end.to_pages(iim),
-            aim=end.to_pages(fill(lit.aim, lit.stand_in)),
-            caustics=None if caustic is None else end.to_pages(fill(caustic, lit.stand_in)),
-            valid=end.valid_pages(lit.stand_in == np.arange(self.texels.count)),
+            aim=end.to_pages(fill(lit.light.aim, lit.light.stand_in)),
+            caustics=None if caustic is None else end.to_pages(fill(caustic, lit.light.stand_in)),
+            valid=end.valid_pages(lit.light.stand_in == np.arange(self.texels.count)),
         )
 
 

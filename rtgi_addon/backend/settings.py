@@ -66,6 +66,10 @@ class SampleCounts:
     cosine: int
     bright: int
 
+    def __post_init__(self) -> None:
+        if self.cosine < 2 or self.bright < 0 or self.cosine % 2 or self.bright % 2:
+            raise ValueError(f"{self}: both must be even, since half of the rays tell the noise of all")
+
     @property
     def total(self) -> int:
         return self.cosine + self.bright

@@ -6,9 +6,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.final_gather.bright import bright_targets
+from rtgi_addon.backend.final_gather.bright import bright_targets, bright_weight
 from rtgi_addon.backend.final_gather.gather import NO_TARGET, GatherRays
-from rtgi_addon.backend.final_gather.links import trace_links
+from rtgi_addon.backend.final_gather.link_store import LinkStore
+from rtgi_addon.backend.final_gather.links import Links
 from rtgi_addon.backend.lamps.sky import make_sky
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.photon.scatter import make_surfaces
@@ -32,11 +33,21 @@ def gather_of(scene, atlas, radiosity, samples, *, seed=0):
     known[: texels.count] = radiosity(texels, frame)[:, None] if radiosity else 0
     if sky:
         known[texels.count :] = sky.radiance * np.pi
-    bright = bright_targets(known, frame.area, sky, geometry.extent)
+    bright = bright_targets([bright_weight(known, frame.area, sky, geometry.extent)])
     tracer = EmbreeTracer(scene, geometry, state, Workers(1))
     surfaces = make_surfaces(geometry, texels, albedo, scene.materials)
     rays = GatherRays(texels, frame, geometry, surfaces, tracer, sky, bright, samples, max_specular=4, seed=seed)
     return rays, texels, frame, sky, len(known)
+
+
+def links_of(rays, *, memory=1 << 30):
+    store = LinkStore(rays, Workers(1), memory=memory)
+    store.renew(rays, all_of(rays))
+    return Links(store, rays, Workers(1))
+
+
+def all_of(rays):
+    return np.arange(rays.texels.count, dtype=np.int32)
 
 
 def closed_box():
@@ -53,7 +64,7 @@ def test_weights_sum_to_one_in_expectation(cosine, bright):
         return 1 + 99.0 * (np.abs(frame.position - frame.position[0]).max(axis=1) < 0.4)
 
     rays, texels, _, _, _ = gather_of(*closed_box(), spot, SampleCounts(cosine, bright))
-    traced = rays.trace(0, texels.count)
+    traced = rays.trace(all_of(rays))
     assert (traced.weight <= 1 / cosine + 1e-6).all() and (traced.weight >= 0).all()
     assert traced.usable.all()
     sums = traced.weight.sum(axis=1)
@@ -62,7 +73,7 @@ def test_weights_sum_to_one_in_expectation(cosine, bright):
 
 def test_chunks_do_not_matter():
     rays, texels, _, _, _ = gather_of(*closed_box(), lambda t, f: np.ones(t.count), SampleCounts(8, 8))
-    whole, part = rays.trace(0, texels.count), rays.trace(101, 333)
+    whole, part = rays.trace(all_of(rays)), rays.trace(all_of(rays)[101:333])
     np.testing.assert_array_equal(whole.target[101:333], part.target)
     np.testing.assert_array_equal(whole.weight[101:333], part.weight)
 
@@ -71,12 +82,12 @@ def test_half_of_the_rays_estimates_the_same_light():
     scene, atlas = scenes.cornell(16)
     samples = SampleCounts(32, 32)
     rays, texels, frame, _, targets = gather_of(scene, atlas, lambda t, f: f.position[:, 2] > 0.9, samples)
-    links = trace_links(rays, texels, targets, samples, Workers(1))
+    links = links_of(rays)
     radiosity = np.repeat((frame.position[:, 2:] > 0.9), 3, axis=1).astype(np.float32)
-    whole, half = links.irradiance(radiosity), links.irradiance(radiosity, from_half=True)
+    whole, half = links.with_half(radiosity)
+    np.testing.assert_array_equal(whole, links.irradiance(radiosity))
     assert half.mean() == pytest.approx(whole.mean(), rel=0.01)
     assert 0 < np.sqrt(np.mean((whole - half) ** 2)) < 0.2 * whole.mean()
-    assert links.half.nnz < 0.6 * links.matrix.nnz
 
 
 def floor_under(world: World | None):
@@ -93,7 +104,7 @@ def test_one_bright_patch_of_sky_lights_like_the_sun(row):
     scene, atlas = floor_under(World(image))
     samples = SampleCounts(16, 16)
     rays, texels, _, sky, targets = gather_of(scene, atlas, None, samples)
-    links = trace_links(rays, texels, targets, samples, Workers(1))
+    links = links_of(rays)
     radiosity = np.zeros((targets, 3), np.float32)
     radiosity[texels.count :] = sky.radiance * np.pi
     patch = row * 128 + 70
@@ -124,6 +135,6 @@ def test_a_finer_sky_is_averaged_without_losing_light():
 def test_rays_that_escape_a_black_world_end_nowhere():
     scene, atlas = floor_under(None)
     rays, texels, _, _, _ = gather_of(scene, atlas, None, SampleCounts(8, 8))
-    traced = rays.trace(0, texels.count)
+    traced = rays.trace(all_of(rays))
     assert traced.target.shape == (64, 8)  # nothing bright: no aimed samples
     assert (traced.target == NO_TARGET).all() and traced.usable.all()

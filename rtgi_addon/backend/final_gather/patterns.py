@@ -28,7 +28,7 @@ PATTERNS = SETS * TILE * TILE
 class CosinePatterns:
     """P patterns of c rays."""
 
-    directions: Float32  # (P, c, 3) cosine-distributed about +z
+    directions: tuple[Float32, Float32, Float32]  # x, y, z (P, c) each, cosine-distributed about +z
     start: Int32  # (P, c) which of the texel's points the ray starts from
 
 
@@ -44,8 +44,8 @@ class BrightPatterns:
 @lru_cache(maxsize=8)
 def cosine_patterns(count: int, seed: int) -> CosinePatterns:
     u, v = (x.reshape(-1) for x in _pair(count, 0, seed))
-    directions = sample_cosine_hemisphere(u, v).astype(np.float32).reshape(PATTERNS, count, 3)
-    return CosinePatterns(directions, _starts(count, 1, seed))
+    x, y, z = np.ascontiguousarray(sample_cosine_hemisphere(u, v).T, np.float32).reshape(3, PATTERNS, count)
+    return CosinePatterns((x, y, z), _starts(count, 1, seed))
 
 
 @lru_cache(maxsize=8)

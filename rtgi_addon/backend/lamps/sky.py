@@ -7,6 +7,7 @@ light map can use. Its "radiosity" is π times its radiance, so links treat sky 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,15 +52,30 @@ class Sky:
         return np.asarray(np.stack([ring * np.cos(angle), ring * np.sin(angle), z], axis=1), np.float32)
 
 
-def make_sky(world: World | None) -> Sky | None:
-    """The patches of ``world``; None for no world or a black one."""
-    if world is None or world.is_black:
+def make_sky(world: World | None, layout: tuple[int, int] | None = None) -> Sky | None:
+    """The patches of ``world``; None for no world or a black one.
+
+    ``layout`` (rows, columns) is that of other frames: a world of one colour takes it, and none at all is black patches
+    of it, so that what was linked to the sky stays so.
+    """
+    dark = world is None or world.is_black
+    if dark and layout is None:
         return None
-    radiance = _shrunk(np.asarray(world.radiance, np.float32))
+    radiance = np.zeros((1, 1, 3), np.float32)
+    if world is not None and not dark:
+        radiance = _shrunk(np.asarray(world.radiance, np.float32))
+    if layout is not None and radiance.shape[:2] == (1, 1):
+        radiance = np.broadcast_to(radiance, (*layout, 3))
     rows, columns = radiance.shape[:2]
     edges = np.sin(np.pi * (np.arange(rows + 1) / rows - 0.5))
     solid = np.repeat(np.diff(edges) * (2 * np.pi / columns), columns)
     return Sky(rows, columns, radiance.reshape(-1, 3), solid.astype(np.float32))
+
+
+def sky_layout(worlds: Iterable[World | None]) -> tuple[int, int] | None:
+    """(rows, columns) of the finest of the ``worlds``; None where none of them shines."""
+    skies = [sky for world in worlds if (sky := make_sky(world)) is not None]
+    return max(((sky.rows, sky.columns) for sky in skies), default=None)
 
 
 def _shrunk(image: Float32) -> Float32:

@@ -23,9 +23,9 @@ class Geometry:
     """Triangles (t) of all instances (n) as they stand in the frame last given to :meth:`update`.
 
     origin (3,) float64 world · extent: diagonal of the first frame's bounds, m · corners (t, 3, 3) float32 local ·
-    normals (t, 3) unit geometric normals, zero for degenerate triangles · corner_normals (t, 3, 3) unit shading
-    normals · instance_of_triangle, material_of_triangle (t,) · first_triangle (n + 1,) · mirrored (n,) bool: the
-    transform is a reflection. Normals point to the side that the object's own front faces, mirrored or not, as
+    normals (t, 3) unit geometric normals, zero for degenerate triangles · areas (t,) m² · corner_normals (t, 3, 3)
+    unit shading normals · instance_of_triangle, material_of_triangle (t,) · first_triangle (n + 1,) · mirrored (n,)
+    bool: the transform is a reflection. Normals point to the side that the object's own front faces, mirrored or not, as
     in Blender.
     """
 
@@ -43,9 +43,11 @@ class Geometry:
         self.extent = float(np.linalg.norm(high - low))
         self.corners: Float32 = np.zeros((total, 3, 3), np.float32)
         self.normals: Float32 = np.zeros((total, 3), np.float32)
+        self.areas: Float32 = np.zeros(total, np.float32)
         self.corner_normals: Float32 = np.zeros((total, 3, 3), np.float32)
         self.mirrored = np.zeros(len(counts), np.bool_)
         self.matrix_world = np.zeros((len(counts), 4, 4), np.float64)
+        self._shapes = {m: self._shape(m, state) for m in {i.mesh for i in scene.instances}}
         for index in range(len(counts)):
             self._place(index, state)
 
@@ -59,13 +61,19 @@ class Geometry:
 
     def update(self, state: FrameState) -> list[int]:
         """Follow ``state``; the instances whose triangles changed, in order."""
-        changed = []
-        for index, instance in enumerate(self.scene.instances):
-            moved = not np.array_equal(state.matrix_world[index], self.matrix_world[index])
-            if moved or instance.mesh in state.vertices:
-                self._place(index, state)
-                changed.append(index)
+        shapes = {m: self._shape(m, state) for m in self._shapes}
+        deformed = {m for m, shape in shapes.items() if not _same(shape, self._shapes[m])}
+        self._shapes = shapes
+        moved = np.any(state.matrix_world != self.matrix_world, axis=(1, 2))
+        changed = [i for i, instance in enumerate(self.scene.instances) if moved[i] or instance.mesh in deformed]
+        for index in changed:
+            self._place(index, state)
         return changed
+
+    def _shape(self, mesh: int, state: FrameState) -> tuple[Float32, Float32]:
+        """Vertices and corner normals of a mesh."""
+        known = self.scene.meshes[mesh]
+        return state.vertices.get(mesh, known.vertices), state.corner_normals.get(mesh, known.corner_normals)
 
     def points(self, triangle: Int32, u: Float32, v: Float32) -> Float32:
         """(n, 3) local points at barycentric weights u, v of ``triangle``'s second and third corner."""
@@ -81,8 +89,7 @@ class Geometry:
     def _place(self, index: int, state: FrameState) -> None:
         mesh_index = self.scene.instances[index].mesh
         mesh = self.scene.meshes[mesh_index]
-        vertices = state.vertices.get(mesh_index, mesh.vertices)
-        shading = state.corner_normals.get(mesh_index, mesh.corner_normals)
+        vertices, shading = self._shapes[mesh_index]
         matrix = np.asarray(state.matrix_world[index], np.float64)
         linear = matrix[:3, :3]
         mirrored = np.linalg.det(linear) < 0
@@ -92,10 +99,16 @@ class Geometry:
         sign = -1.0 if mirrored else 1.0
         self.corners[rows] = corners
         self.normals[rows] = sign * triangle_normals(corners)
+        self.areas[rows] = triangle_areas(self.corners[rows])
         # Cofactors carry normals through any transform, also a flat one; a reflection turns them round.
         self.corner_normals[rows] = unit(shading.astype(np.float64) @ (sign * cofactors(linear)).T)
         self.mirrored[index] = mirrored
         self.matrix_world[index] = matrix
+
+
+def _same(a: tuple[Float32, Float32], b: tuple[Float32, Float32]) -> bool:
+    """The same arrays, or the same bits (NaN included)."""
+    return all(x is y or (x.shape == y.shape and x.tobytes() == y.tobytes()) for x, y in zip(a, b, strict=True))
 
 
 def world_bounds(scene: Scene, state: FrameState) -> tuple[Float64, Float64]:
@@ -138,3 +151,10 @@ def triangle_normals(corners: Float64) -> Float64:
     # Below this ratio of height to length the float32 corners no longer define a direction.
     good = area > longest * 1e-7
     return np.divide(cross, area[:, None], out=np.zeros_like(cross), where=good[:, None])
+
+
+def triangle_areas(corners: Float32) -> Float32:
+    """(t,) m² of ``corners`` (t, 3, 3); summed in float64, as micrometre triangles would vanish in float32."""
+    wide = corners.astype(np.float64)
+    cross = np.cross(wide[:, 1] - wide[:, 0], wide[:, 2] - wide[:, 0])
+    return np.asarray(0.5 * np.sqrt(np.einsum("ij,ij->i", cross, cross)), np.float32)

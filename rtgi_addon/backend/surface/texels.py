@@ -8,7 +8,7 @@ Larsen04's maps are per hand-made surface; here a surface is one UV island of on
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,8 @@ from scipy.spatial import cKDTree
 from ..scene import Atlas, Bool, Float32, Float64, Int32, Material, Mesh, Placement, Scene
 from .geometry import Geometry, unit
 from .rasterise import POINTS, RasterTexels, rasterise
+
+Rows = NDArray[np.integer[Any]]
 
 FRONT, BACK = 0, 1
 #: The lookup image is widened by this many pixels, so that a hit on an island's border, moved over it by rounding,
@@ -86,6 +88,7 @@ class TexelFrame:
     geometric_normal: Float32  # (n, 3) unit, out of the texel's own side
     points: Float32  # (n, POINTS, 3) spread over the texel's surface, lifted off it: where rays start and end
     area: Float32  # (n,) m²
+    reach: Float32  # (n,) m: of the farthest of the points from the position
 
 
 def make_texels(scene: Scene, atlas: Atlas, geometry: Geometry) -> Texels:
@@ -246,40 +249,52 @@ def stand_ins(texels: Texels, valid: Bool) -> Int32:
 
 def place_texels(texels: Texels, geometry: Geometry) -> TexelFrame:
     """The texels' place in the frame that ``geometry`` stands in."""
-    corners = geometry.corners[texels.triangle]  # (n, 3, 3)
+    return _placed(texels, geometry, np.arange(texels.count))
+
+
+def follow_texels(frame: TexelFrame, texels: Texels, geometry: Geometry, rows: Rows) -> None:
+    """Bring the texels ``rows`` (k,) of ``frame`` to where ``geometry`` stands; the same bits as all placed anew."""
+    if len(rows):
+        moved = _placed(texels, geometry, rows)
+        for f in fields(TexelFrame):
+            getattr(frame, f.name)[rows] = getattr(moved, f.name)
+
+
+def _placed(texels: Texels, geometry: Geometry, rows: Rows) -> TexelFrame:
+    """The texels ``rows`` (k,)."""
+    triangle, barycentric = texels.triangle[rows], texels.barycentric[rows]
+    corners = geometry.corners.take(triangle, axis=0)  # (k, 3, 3)
     e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    u, v = texels.barycentric[:, :1], texels.barycentric[:, 1:]
-    facing = np.where(texels.side == BACK, -1.0, 1.0).astype(np.float32)[:, None]
-    shading = geometry.corner_normals[texels.triangle]
+    u, v = barycentric[:, :1], barycentric[:, 1:]
+    facing = np.where(texels.side[rows] == BACK, np.float32(-1), np.float32(1))[:, None]
+    shading = geometry.corner_normals.take(triangle, axis=0)
     normal = unit((shading[:, 0] * (1 - u - v) + shading[:, 1] * u + shading[:, 2] * v).astype(np.float64))
-    geometric = geometry.normals[texels.triangle]
+    geometric = geometry.normals.take(triangle, axis=0)
     # No shading normal (it vanished between opposite corners, or the mesh has none): the triangle's own.
-    lost = np.einsum("ij,ij->i", normal, normal) < 0.5
+    lost = (normal * normal).sum(axis=1) < 0.5
     normal[lost] = geometric[lost]
+    position = np.asarray(corners[:, 0] + e1 * u + e2 * v, np.float32)
+    points = _lifted_points(texels, geometry, rows)
+    away = points - position[:, None]
+    share = texels.share if len(rows) == texels.count else texels.share[rows]
     return TexelFrame(
-        position=corners[:, 0] + e1 * u + e2 * v,
+        position=position,
         normal=(normal * facing).astype(np.float32),
         geometric_normal=geometric * facing,
-        points=_lifted_points(texels, geometry),
-        area=np.asarray(texels.share @ triangle_areas(geometry), np.float32),
+        points=points,
+        area=np.asarray(share @ geometry.areas, np.float32),
+        reach=np.sqrt((away * away).sum(axis=2).max(axis=1, initial=0)),
     )
 
 
-def _lifted_points(texels: Texels, geometry: Geometry) -> Float32:
-    """(n, POINTS, 3) each point lifted off its own triangle, to the texel's side."""
-    triangle = texels.point_triangle.reshape(-1)
-    u, v = texels.point_barycentric.reshape(-1, 2).T
+def _lifted_points(texels: Texels, geometry: Geometry, rows: Rows) -> Float32:
+    """(k, POINTS, 3) each point lifted off its own triangle, to the texel's side."""
+    triangle = texels.point_triangle[rows].reshape(-1)
+    u, v = texels.point_barycentric[rows].reshape(-1, 2).T
     points = geometry.points(triangle, u, v)
-    facing = np.where(texels.side == BACK, np.float32(-1), np.float32(1)).repeat(POINTS)
+    facing = np.where(texels.side[rows] == BACK, np.float32(-1), np.float32(1)).repeat(POINTS)
     lift = (geometry.offset_length(points) * facing)[:, None]
     return np.asarray(points + geometry.normals.take(triangle, axis=0) * lift, np.float32).reshape(-1, POINTS, 3)
-
-
-def triangle_areas(geometry: Geometry) -> Float32:
-    """(t,) m², in float64 inside: a float32 cross product of micrometre triangles would vanish."""
-    corners = geometry.corners.astype(np.float64)
-    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return np.asarray(0.5 * np.sqrt(np.einsum("ij,ij->i", cross, cross)), np.float32)
 
 
 def texel_colours(

@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Gather rays kept from frame to frame: K a texel in fixed arrays, which are at once the rows of a sparse matrix.
+
+A link is a ray's target and weight; its length is kept to test it against what moves. Objects that move disturb the
+links they touch, and only those are traced again (DESIGN §5). What does not fit the memory allowed is traced anew
+whenever its light is asked for.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..parallel import CHUNK_RAYS, Workers
+from ..scene import Bool, Float32, Float64, Int32
+from ..selection.sweep import Sweep
+from .beyond_store import BeyondStore
+from .gather import NO_TARGET, GatherRays, TracedTexels
+from .touched import touched_rays
+
+#: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
+#: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
+LEAST_FREE_SHARE = 0.9
+#: Target, weight and pending mark of a link; a cosine ray's length besides.
+BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
+
+
+@dataclass
+class LinkWork:
+    """What one frame's update of the links took."""
+
+    changed: Bool  # (n,) texels of which some link was traced anew
+    traced: int = 0  # rays
+    renewed: int = 0  # links
+    kept: int = 0  # links
+
+
+class LinkStore:
+    """The links of n texels to m targets and to nothing (number m), K each; those of the first ``kept`` texels stay.
+
+    A texel's slots are in two halves, each a good set of rays by itself: half of the cosine rays, half of the aimed
+    ones, then the others. target, weight (kept, K): weight 0 where a ray is not usable · distance (kept, cosine).
+    """
+
+    def __init__(self, rays: GatherRays, workers: Workers, *, memory: int) -> None:
+        """Nothing is traced yet. ``memory``: bytes that links may take."""
+        count, slots = rays.texels.count, rays.n_cosine + rays.n_bright
+        per_texel = slots * BYTES_PER_LINK + rays.n_cosine * BYTES_PER_LENGTH
+        self.count, self.kept, self.nothing = count, min(count, memory // per_texel), rays.target_count
+        self._workers, self._cosine, self._bright = workers, rays.n_cosine, rays.n_bright
+        self.target = np.zeros((self.kept, slots), np.int32)
+        self.weight = np.zeros((self.kept, slots), np.float32)
+        self._distance = np.zeros((self.kept, rays.n_cosine), np.float32)
+        self.total: Float64 = np.zeros((count, 2))  # weight of each half
+        self.valid: Bool = np.ones(count, np.bool_)
+        self._cut: Bool = np.zeros(count, np.bool_)
+        self._pending = np.ones((self.kept, slots), np.bool_)
+        self._pending_texel = np.ones(count, np.bool_)
+        self.beyond = BeyondStore(rays.n_cosine)
+        self._cosine_slots, self._aimed_slots = _slots(rays.n_cosine, rays.n_bright)
+
+    @property
+    def bytes(self) -> int:
+        """Memory that the kept links take."""
+        return self.target.nbytes + self.weight.nbytes + self._distance.nbytes + self._pending.nbytes
+
+    @property
+    def pending(self) -> Bool:
+        """(n,) texels with links that an object touched and that were not traced since."""
+        return self._pending_texel.copy()
+
+    def disturb(self, rays: GatherRays, sweep: Sweep, reach: Float32) -> int:
+        """Mark the links that the ``sweep`` touches; how many were looked at one by one.
+
+        ``rays`` of the new frame; reach (n,) m: of each texel's points from its middle.
+        """
+        if not sweep.any:
+            return 0
+        self._pending_texel[self.kept :] = True
+        moved = sweep.moved[rays.texels.instance]
+        whole = moved | self._cut_near(rays, sweep, reach)
+        texel = np.nonzero(~(whole[: self.kept] | self._pending.all(axis=1)))[0].astype(np.int32)
+
+        def part(rows: slice) -> int:
+            of = texel[rows]
+            found = touched_rays(rays, sweep, of, self._distance[of], reach)
+            mark = np.zeros((len(of), self.target.shape[1]), np.bool_)
+            mark[:, self._cosine_slots], mark[:, self._aimed_slots] = found.cosine, found.aimed
+            self._pending[of] |= mark
+            return found.tested
+
+        chunk = max(1, CHUNK_RAYS // self.target.shape[1])
+        tested = sum(self._workers.map_slices(part, len(texel), chunk))
+        of, number = self.beyond.touched(sweep)
+        self._pending[of, self._cosine_slots[number]] = True
+        touched = self._pending[texel].any(axis=1) if len(texel) else np.zeros(0, np.bool_)
+        # Which part of a texel that is cut through is open hangs on all its rays.
+        whole[texel[touched & self._cut[texel]]] = True
+        self._pending[whole[: self.kept]] = True
+        self._pending_texel |= whole
+        self._pending_texel[texel[touched]] = True
+        return tested
+
+    def renew(self, rays: GatherRays, texel: Int32) -> LinkWork:
+        """Trace the pending links of ``texel`` (m,)."""
+        work = LinkWork(np.zeros(self.count, np.bool_))
+        texel = texel[self._pending_texel[texel]]
+        inside = texel[texel < self.kept]
+        some = ~self._pending[inside].all(axis=1)
+        grown = self._renew_rays(rays, inside[some], work)
+        self._renew_texels(rays, np.concatenate([inside[~some], grown]), work)
+        self._renew_texels(rays, texel[texel >= self.kept], work)
+        work.changed[texel] = True
+        work.kept = self.target.size - work.renewed
+        self._pending[inside] = False
+        self._pending_texel[texel] = False
+        return work
+
+    def _cut_near(self, rays: GatherRays, sweep: Sweep, reach: Float32) -> Bool:
+        """(n,) texels that are cut through and that a place comes near to."""
+        near = np.zeros(self.count, np.bool_)
+        cut = np.nonzero(self._cut)[0]
+        for place in sweep.places:
+            away = rays.frame.position[cut] - place.centre.astype(np.float32)
+            far = np.float32(place.radius) + 2 * reach[cut]
+            near[cut[(away * away).sum(axis=1) <= far * far]] = True
+        return near
+
+    def _renew_rays(self, rays: GatherRays, texel: Int32, work: LinkWork) -> Int32:
+        """Trace the pending links of ``texel``, whose others stay; texels that turned out to be cut through."""
+        if not len(texel):
+            return texel
+        pending = self._pending[texel]
+        row, number = np.nonzero(pending[:, self._cosine_slots])
+        of, number = texel[row], number.astype(np.int32)
+        beyond = []
+
+        def cosine(rows: slice) -> tuple[int, Int32]:
+            t, k = of[rows], number[rows]
+            fan = rays.cosine(t, k)
+            slot = self._cosine_slots[k]
+            self.target[t, slot] = self._column(fan.target)
+            self.weight[t, slot] = np.where(fan.dark | fan.below, np.float32(0), fan.weight)
+            self._distance[t, k] = fan.hits.distance
+            found = rays.beyond(t, k, fan)
+            beyond.append((rows.start, found))
+            return len(t) + found.rays, t[fan.dark]
+
+        done = self._workers.map_slices(cosine, len(of))
+        work.traced += sum(d[0] for d in done)
+        work.renewed += int(np.count_nonzero(pending))
+        self.beyond.replace_rays(of, number, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
+        if self._bright:
+            work.traced += self._renew_aimed(rays, texel, pending)
+        self._sum(texel)
+        return np.asarray(np.unique(np.concatenate([np.zeros(0, np.int32), *(d[1] for d in done)])))
+
+    def _renew_aimed(self, rays: GatherRays, texel: Int32, pending: Bool) -> int:
+        row, number = np.nonzero(pending[:, self._aimed_slots])
+        of, number = texel[row], number.astype(np.int32)
+
+        def aimed(rows: slice) -> int:
+            t, k = of[rows], number[rows]
+            found = rays.aimed(t, k)
+            slot = self._aimed_slots[k]
+            self.target[t, slot], self.weight[t, slot] = found.target, found.weight
+            return found.cast
+
+        return sum(self._workers.map_slices(aimed, len(of)))
+
+    def _renew_texels(self, rays: GatherRays, texel: Int32, work: LinkWork) -> None:
+        """Trace all links of ``texel``."""
+        if not len(texel):
+            return
+        beyond = []
+
+        def part(rows: slice) -> int:
+            of = texel[rows]
+            traced = rays.trace(of)
+            target, weight = self.rows(traced)
+            self.valid[of], self._cut[of] = traced.free >= LEAST_FREE_SHARE, traced.cut
+            self.total[of] = _totals(weight)
+            inside = of < self.kept
+            at = of[inside]
+            self.target[at], self.weight[at], self._distance[at] = (
+                target[inside],
+                weight[inside],
+                traced.distance[inside],
+            )
+            if inside.all():
+                beyond.append((rows.start, traced.beyond))
+            return traced.rays
+
+        work.traced += sum(self._workers.map_slices(part, len(texel), self.chunk))
+        work.renewed += int(np.count_nonzero(texel < self.kept)) * self.target.shape[1]
+        self.beyond.replace_texels(texel, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
+
+    def rows(self, traced: TracedTexels) -> tuple[Int32, Float32]:
+        """((m, K), (m, K)) target and weight of traced texels, as kept."""
+        order = np.argsort(np.concatenate([self._cosine_slots, self._aimed_slots]))
+        target = self._column(traced.target[:, order])
+        return target, np.where(traced.usable, traced.weight, np.float32(0))[:, order]
+
+    @property
+    def chunk(self) -> int:
+        """Texels worked on at a time."""
+        return max(1, CHUNK_RAYS // self.target.shape[1])
+
+    def _column(self, target: Int32) -> Int32:
+        return np.where(target == NO_TARGET, np.int32(self.nothing), target)
+
+    def _sum(self, texel: Int32) -> None:
+        self.total[texel] = _totals(self.weight[texel])
+
+
+def _totals(weight: Float32) -> Float64:
+    """(m, 2) sums of both halves of each row (m, K); in rows of their own, so that they do not hang on each other."""
+    halves = weight.reshape(len(weight), 2, -1).astype(np.float64)
+    return np.asarray(np.add.reduce(halves, axis=2))
+
+
+def _slots(cosine: int, bright: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """((cosine,), (bright,)) slot of each ray: the first half of both kinds, then the second."""
+    c, b = np.arange(cosine), np.arange(bright)
+    return np.where(c < cosine // 2, c, c + bright // 2), np.where(b < bright // 2, b + cosine // 2, b + cosine)
