@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""docs/benchmarks.md and its plots, from the points of a run."""
+"""Speed against error: its part of docs/benchmarks.md and its plots, from the points of a run."""
 
 from __future__ import annotations
 
-import platform
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from .document import PLOTS, machine_lines, write_part
 from .points import Crossing, Point, crossing_or_none
 from .reference import load_reference
 from .results import Machine
 from .table import HELD_TO, LEAST_WHOLE, TARGETS, BenchScene, Curve
 
-PLOTS = "benchmarks"
 STYLE = {
     Curve.OURS: {"color": "#d95f02", "linestyle": ":", "marker": "o", "fillstyle": "none"},
     Curve.OURS_DENOISED: {"color": "#d95f02", "linestyle": "-", "marker": "o"},
@@ -24,23 +23,21 @@ STYLE = {
 def write_report(
     results: Mapping[BenchScene, Sequence[Point]], machines: Mapping[BenchScene, Machine], docs: Path
 ) -> None:
-    """Write ``docs``/benchmarks.md and one plot for each scene."""
+    """Write the part into ``docs``/benchmarks.md and one plot for each scene."""
     (docs / PLOTS).mkdir(parents=True, exist_ok=True)
     parts = [_head(next(iter(machines.values())))]
     for scene, points in results.items():
         _plot(scene, points, docs / PLOTS / f"{scene.name}.png")
         parts.append(_scene(scene, points, machines[scene]))
-    (docs / "benchmarks.md").write_text("\n".join(parts), encoding="utf-8")
+    write_part(docs, "speed", "\n".join(parts))
 
 
 def _head(machine: Machine) -> str:
-    versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
-    return f"""# Speed against error
+    return f"""## Speed against error
 
-Written by `python -m bench`; every figure here was measured in one run, the engines taking turns.
+One frame, beside Cycles; the engines take turns.
 
-- **Machine:** {machine.processor}, {machine.threads} threads, no GPU used, {platform.system()}.
-- **Versions:** {versions}.
+{machine_lines(machine)}
 - **Error:** RMS difference from the reference over texels and channels, divided by the reference's mean; the
   reference's own noise is taken out in quadrature. Bias is the mean difference, P95 the 95th percentile of the
   absolute difference, both divided by the same mean. Medians over seeds.
@@ -67,7 +64,7 @@ def _scene(scene: BenchScene, points: Sequence[Point], machine: Machine) -> str:
     passes = f"{len(made['seeds'])} passes of {made['samples_per_point_and_pass']} samples at each point"
     rows = "\n".join(_row(p) for p in points)
     return f"""
-## {scene.title}
+### {scene.title}
 
 Atlas of {made["resolution"]} x {made["resolution"]} pixels, compared at {compared} texels chosen at random. Of
 the {count} texels of the reference {under} lie under or partly under another object and {partly} are surface by less

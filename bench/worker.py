@@ -15,10 +15,11 @@ from rtgi_addon.backend.finish.denoise import MapDenoiser
 from rtgi_addon.backend.finish.oidn import Denoiser, find_oidn
 from rtgi_addon.backend.scene import Bool, Float32, Int32
 from rtgi_addon.backend.session import FrameResult, Session
-from rtgi_addon.backend.settings import SAMPLES_OF_QUALITY, BakeSettings, SampleCounts
+from rtgi_addon.backend.settings import SampleCounts
 from rtgi_addon.backend.surface.texels import Texels
 from rtgi_addon.environment import device, library_folders, versions
 
+from .baking import settings_of
 from .cycles_bake import CyclesBake
 from .errors import Errors, compare
 from .measure import Cost, Meter
@@ -80,24 +81,12 @@ def _run_ours(subject: Subject, meter: Meter, method: Method, seed: int) -> list
     return runs
 
 
-def _settings(counts: SampleCounts, **options: Any) -> BakeSettings:
-    """Settings of the quality that has these sample counts; counts without a name are put in its place."""
-    for quality, named in SAMPLES_OF_QUALITY.items():
-        if named == counts:
-            return BakeSettings(quality=quality, **options)
-
-    class Counted(BakeSettings):
-        samples = property(lambda self: counts)
-
-    return Counted(**options)
-
-
 def _bake(
     subject: Subject, meter: Meter, samples: SampleCounts, *, seed: int, denoise: bool
 ) -> tuple[FrameResult, Cost]:
     """All that a bake does after extraction, from a new session to its maps."""
     p = subject.prepared
-    settings = _settings(samples, seed=seed, denoise=denoise, resolution=p.atlas.resolution)
+    settings = settings_of(samples, seed=seed, denoise=denoise, resolution=p.atlas.resolution)
 
     def work() -> FrameResult:
         with Session(p.scene, p.atlas, settings, p.first, oidn_paths=library_folders()) as session:
