@@ -98,7 +98,6 @@ class _Shown:
 
     maps: dict[str, Small] = field(default_factory=dict)  # by kind
     change: _Change | None = None  # None: no frame before
-    side: int = 0  # of the page, texels
 
 
 def _sheet(baked: BakeRecord, listener: Listener) -> Sheet:
@@ -121,7 +120,7 @@ def _sheet(baked: BakeRecord, listener: Listener) -> Sheet:
         frame_count=len(baked.frames),
         pages=tuple(tuple(_rows(p, frames, looks[p], kinds, exposed, scale)) for p in pages),
         page_count=baked.pages,
-        block=block_side(shown[0].side, shown[0].side),
+        block=block_side(baked.resolution, baked.resolution),
         exposed=exposed,
         change=scale,
     )
@@ -130,23 +129,31 @@ def _sheet(baked: BakeRecord, listener: Listener) -> Sheet:
 def _look(baked: BakeRecord, page: int, index: int, kinds: list[str]) -> _Shown:
     """Page ``page`` of the frame at ``index``, and how its IIM changed since the frame before."""
     frame = baked.frames[index]
-    maps, change, side = {}, None, 0
+    maps, change = {}, None
     for kind in kinds:
         name = map_name(kind, page, frame.number)
         if name not in frame.files:
             continue
-        rgb, valid = read_page(baked.folder / name)
-        maps[kind], side = shrink(rgb, valid), len(rgb)
+        rgb, valid = _read(baked, name)
+        maps[kind] = shrink(rgb, valid)
         if kind == "iim" and index > 0:
             change = _change(baked, page, baked.frames[index - 1], rgb, valid)
-    return _Shown(maps, change, side)
+    return _Shown(maps, change)
+
+
+def _read(baked: BakeRecord, name: str) -> tuple[Float32, Bool]:
+    rgb, valid = read_page(baked.folder / name)
+    if valid.shape != (baked.resolution, baked.resolution):
+        size = "{1} × {0}".format(*valid.shape)
+        raise BakeError(f"{baked.folder / name}: is {size} pixels, not as bake.json has it; bake that frame again")
+    return rgb, valid
 
 
 def _change(baked: BakeRecord, page: int, before: BakedFrame, rgb: Float32, valid: Bool) -> _Change | None:
     name = map_name("iim", page, before.number)
     if name not in before.files:
         return None
-    old, old_valid = read_page(baked.folder / name)
+    old, old_valid = _read(baked, name)
     valid = valid & old_valid
     differs = valid & np.any(rgb != old, axis=-1)
     change = luminance(rgb - old)
@@ -171,7 +178,7 @@ def _rows(
         yield Row(*KINDS[kind], tuple(tiles))
         if kind == "iim" and len(frames) > 1:
             changes = tuple(_change_tile(frame, look.change, scale) for frame, look in zip(frames, looks, strict=True))
-            yield Row("Change", "of the IIM", changes)
+            yield Row("Change", "of the IIM, W/m²", changes)
 
 
 def _change_tile(frame: BakedFrame, change: _Change | None, scale: float) -> Tile:

@@ -13,12 +13,15 @@ from html import escape
 from statistics import median
 
 #: Of the drawing, in units that are CSS pixels at the page's full width.
-HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 190, 52, 8, 10, 24
+HEIGHT, LEFT, RIGHT, TOP, BOTTOM = 196, 52, 8, 16, 24
 WIDE, NARROW = 1040, 508
 #: Widest bar, and the slot from which on bars stand apart.
 BAR, APART = 44.0, 5.0
 #: About how many numbers an axis has.
 TICKS, LABELS = 4, 10
+#: Bars so many times higher than those of all other frames are cut off, with their number on top: a bake's first frame
+#: is computed whole, and would flatten the rest. One frame may be, and one more for each so many.
+CUT, CUT_FRAMES = 3.0, 50
 
 Values = tuple[float | None, ...]
 
@@ -52,13 +55,14 @@ class Chart:
 
 def draw(chart: Chart) -> str:
     """``chart`` as an HTML figure."""
-    top, step = scale_of(_highest(chart))
+    top, step = scale_of(_end(chart))
     width = WIDE if chart.wide else NARROW
     slot = (width - LEFT - RIGHT) / len(chart.frames)
     paper = _Paper(width, slot, top)
     parts = [
-        *_axes(chart, paper, top, step),
+        *_axes(chart, paper, step),
         *_bars(chart, paper),
+        *_cuts(chart, paper),
         *(_line(s, paper) for s in chart.lines if any(s.values)),
     ]
     if chart.level is not None:
@@ -85,10 +89,8 @@ class _Paper:
         return LEFT + (index + 0.5) * self.slot
 
     def y(self, value: float) -> float:
-        return HEIGHT - BOTTOM - self.height(value)
-
-    def height(self, value: float) -> float:
-        return value / self.top * (HEIGHT - TOP - BOTTOM)
+        """Where ``value`` ends, at most at the end of the axis."""
+        return HEIGHT - BOTTOM - min(value / self.top, 1.0) * (HEIGHT - TOP - BOTTOM)
 
     @property
     def bar(self) -> float:
@@ -112,15 +114,31 @@ def brief(value: float) -> str:
     return f"{value:.3g}"
 
 
-def _highest(chart: Chart) -> float:
-    stacks = [sum(s.values[i] or 0 for s in chart.bars) for i in range(len(chart.frames))]
+def _stacks(chart: Chart) -> list[float]:
+    return [sum(series.values[i] or 0 for series in chart.bars) for i in range(len(chart.frames))]
+
+
+def _end(chart: Chart) -> float:
+    """What the axis must hold."""
+    stacks = sorted(_stacks(chart), reverse=True)
+    few = 1 + len(stacks) // CUT_FRAMES
+    cut = len(stacks) > few and 0 < CUT * stacks[few] < stacks[0]
     lines = [value or 0 for series in chart.lines for value in series.values]
-    return max((*stacks, *lines, 0 if chart.level is None else chart.level[1]))
+    return max((stacks[few] if cut else stacks[0], *lines, 0 if chart.level is None else chart.level[1]))
 
 
-def _axes(chart: Chart, paper: _Paper, top: float, step: float) -> list[str]:
+def _cuts(chart: Chart, paper: _Paper) -> list[str]:
+    """The numbers of the bars that are cut off."""
+    return [
+        f'<text x="{paper.x(index) - paper.bar / 2:.1f}" y="{TOP - 4}">↑ {escape(chart.tell(stack))}</text>'
+        for index, stack in enumerate(_stacks(chart))
+        if stack > paper.top * (1 + 1e-9)
+    ]
+
+
+def _axes(chart: Chart, paper: _Paper, step: float) -> list[str]:
     parts = []
-    for tick in range(round(top / step) + 1):
+    for tick in range(round(paper.top / step) + 1):
         y = paper.y(tick * step)
         parts.append(f'<path class="{"grid" if tick else "base"}" d="M{LEFT} {y:.1f}H{paper.width - RIGHT}"/>')
         parts.append(f'<text x="{LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{brief(tick * step)}</text>')
@@ -135,14 +153,16 @@ def _axes(chart: Chart, paper: _Paper, top: float, step: float) -> list[str]:
 def _bars(chart: Chart, paper: _Paper) -> list[str]:
     """One path for each series: some pages have thousands of bars."""
     below = [0.0] * len(chart.frames)
+    shown = [min(1.0, paper.top / stack) if stack else 1.0 for stack in _stacks(chart)]  # a cut bar keeps its shares
     parts = []
     for series in chart.bars:
         boxes = []
         for index, value in enumerate(series.values):
             if value:
-                x, height = paper.x(index) - paper.bar / 2, paper.height(value)
-                boxes.append(f"M{x:.2f} {paper.y(below[index]):.2f}v{-height:.2f}h{paper.bar:.2f}v{height:.2f}z")
-                below[index] += value
+                x, foot = paper.x(index) - paper.bar / 2, paper.y(below[index])
+                below[index] += value * shown[index]
+                height = foot - paper.y(below[index])
+                boxes.append(f"M{x:.2f} {foot:.2f}v{-height:.2f}h{paper.bar:.2f}v{height:.2f}z")
         parts.append(f'<path class="{series.colour}" d="{"".join(boxes)}"/>')
     return parts
 

@@ -13,6 +13,8 @@ from .report_record import BakedFrame, BakeRecord
 
 #: Stages that are drawn apart, the costliest; the others are one.
 STAGES = 6
+#: From so many frames on, cost and error take the whole width.
+WIDE_FRAMES = 16
 
 
 def duration(seconds: float) -> str:
@@ -64,7 +66,7 @@ def _seconds(frames: tuple[BakedFrame, ...]) -> Chart:
     if others:
         rest = tuple(sum(frame.seconds.get(stage, 0.0) for stage in others) for frame in frames)
         bars.append(Series("all else", rest, "kept"))
-    return Chart("Time by stage", "seconds a frame", _numbers(frames), duration, tuple(bars), wide=True)
+    return Chart("Time by stage", "seconds a frame", _numbers(frames), duration, tuple(bars), wide=_wide(frames))
 
 
 def _error(baked: BakeRecord) -> Chart:
@@ -73,12 +75,12 @@ def _error(baked: BakeRecord) -> Chart:
     asked = baked.settings.get("target_error")
     return Chart(
         title="Estimated error",
-        unit="% of the IIM's mean, RMS, after denoising",
+        unit="% of the IIM's mean, RMS",
         frames=_numbers(baked.frames),
         tell=lambda value: percent(value / 100),
         lines=(Series("estimated error", values, "c5"),),
         level=None if asked is None else ("asked for", 100 * asked),
-        wide=True,
+        wide=_wide(baked.frames),
     )
 
 
@@ -116,6 +118,10 @@ def _counted(frames: tuple[BakedFrame, ...], names: dict[str, str], colours: tup
         if any(value is not None for value in values):
             found.append(Series(name, values, colour))
     return found
+
+
+def _wide(frames: tuple[BakedFrame, ...]) -> bool:
+    return len(frames) >= WIDE_FRAMES
 
 
 def _numbers(frames: tuple[BakedFrame, ...]) -> tuple[int, ...]:

@@ -80,10 +80,8 @@ def _words(sheet: Sheet) -> list[str]:
         words.append(f"The first {len(sheet.pages)} of {sheet.page_count} pages.")
     if sheet.block > 1:
         words.append(f"A pixel here is the mean of {sheet.block} × {sheet.block} texels.")
-    return [
-        *words,
-        "All have the same exposure. Click one to see it large; the arrow keys then step through the frames.",
-    ]
+    steps = "; the arrow keys then step through the frames" if len(sheet.frames) > 1 else ""
+    return [*words, f"All have the same exposure. Click one to see it large{steps}."]
 
 
 def _strip(page: int, rows: tuple[Row, ...], frames: tuple[int, ...]) -> str:
@@ -138,7 +136,7 @@ def _ramp(name: str, title: str, colours: np.ndarray, ticks: list[tuple[float, s
     return (
         f'<figure><figcaption>{escape(title)}</figcaption><svg viewBox="0 0 400 34" role="img"'
         f' aria-label="{escape(title)}"><linearGradient id="{name}">{stops}</linearGradient>'
-        f'<rect width="400" height="14" rx="2" fill="url(#{name})"/>{texts}</svg></figure>'
+        f'<rect width="400" height="14" rx="2" class="ramp" fill="url(#{name})"/>{texts}</svg></figure>'
     )
 
 

@@ -15,6 +15,7 @@ from string import Template
 from typing import Any
 
 from .backend.settings import BakeSettings
+from .report_charts import CUT
 from .report_figures import charts, duration, percent, whole
 from .report_maps import Sheet, strips
 from .report_record import BakeRecord
@@ -76,8 +77,12 @@ def _summary(baked: BakeRecord) -> str:
     count = f"{done} frame{'s' * (done != 1)}" if done == asked else f"{done} of {asked} frames"
     if not done:
         return f"No frame is finished, of {asked} asked for."
-    usual = median(frame.total_seconds for frame in baked.frames)
-    text = f"{count}, {duration(usual)}{' each' if done > 1 else ''}"
+    seconds = [frame.total_seconds for frame in baked.frames]
+    usual = duration(median(seconds))
+    if seconds[0] > CUT * median(seconds):
+        text = f"{count}: the first in {duration(seconds[0])}, then {usual} each"
+    else:
+        text = f"{count}, {usual}{' each' if done > 1 else ''}"
     errors = sorted(frame.error for frame in baked.frames if frame.error is not None)
     return f"{text}; estimated error {_range(errors)}." if errors else f"{text}."
 
@@ -120,11 +125,12 @@ def _settings(settings: dict[str, Any]) -> str:
     """What was chosen, and the rest on a click."""
     usual = {f.name: f.default for f in fields(BakeSettings)}
     chosen = {k: v for k, v in settings.items() if k not in usual or v != usual[k]}
-    first = ", ".join(_setting(*item) for item in chosen.items()) or "all as by default"
+    first = ", ".join(_setting(*item) for item in chosen.items())
     rest = ", ".join(_setting(*item) for item in settings.items() if item[0] not in chosen)
     if not rest:
         return escape(first)
-    return f"{escape(first)}<details><summary>the others, as by default</summary>{escape(rest)}</details>"
+    others = "the others, as by default" if first else "all as by default"
+    return f"{escape(first)}<details><summary>{others}</summary>{escape(rest)}</details>"
 
 
 def _setting(name: str, value: Any) -> str:

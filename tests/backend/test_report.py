@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from rtgi_addon.backend.errors import BakeError
 from rtgi_addon.backend.settings import BakeSettings
 from rtgi_addon.backend.stats import FrameStats
-from rtgi_addon.report_charts import HEIGHT, LEFT, NARROW, RIGHT, Chart, Series, draw, scale_of
+from rtgi_addon.report_charts import BOTTOM, HEIGHT, LEFT, NARROW, RIGHT, TOP, Chart, Series, draw, scale_of
 from rtgi_addon.report_figures import duration, whole
 from rtgi_addon.report_maps import PAGES, PICTURES, columns, spread
 from rtgi_addon.report_page import make_page, name_frames
@@ -202,6 +202,18 @@ def test_all_that_is_drawn_lies_inside_and_is_told(values: list[float]) -> None:
         assert 0 <= bottom - height + 0.02 and bottom <= HEIGHT
     told = [output.get("data-told", "").split("|") for output in figure.iter("output")]
     assert told == [[whole(v) for v in values]] * 2
+
+
+def test_a_first_frame_that_would_flatten_the_rest_is_cut_and_told() -> None:
+    low = Series("low", (30.0, *[1.0] * 9), "c0")
+    figure = drawn(frames=tuple(range(10)), bars=(low, Series("high", (900.0, *[1.0] * 9), "c1")))
+    plot = HEIGHT - TOP - BOTTOM
+    assert [box[2] for box in boxes(figure, "c0")] == pytest.approx([plot * 30 / 930, *[plot / 2] * 9], abs=0.01)
+    assert [box[2] for box in boxes(figure, "c1")] == pytest.approx([plot * 900 / 930, *[plot / 2] * 9], abs=0.01)
+    told = [text.text for text in figure.findall(".//s:text", SVG) if "↑" in (text.text or "")]
+    assert told == ["↑ 930"]
+    several = drawn(frames=tuple(range(10)), bars=(Series("a door opens", (*[1.0] * 6, *[9.0] * 4), "c0"),))
+    assert "↑" not in "".join(several.itertext())
 
 
 @given(st.floats(1e-9, 1e12))
