@@ -8,9 +8,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.lamps.direct import MOST_SHEETS, direct_irradiance, lamp_irradiance, make_shadows
+from rtgi_addon.backend.lamps.direct import (
+    MOST_SHEETS,
+    direct_irradiance,
+    irradiance_of,
+    lamp_irradiance,
+    make_receivers,
+    make_shadows,
+    reached,
+)
 from rtgi_addon.backend.photon.photon_map import direct_hits
 from rtgi_addon.backend.scene import AreaShape, Instance, Light, LightKind, Material, Scene
+from tests.backend.lamps import LAMPS
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import cornell, grid_atlas, point_light, quad, sphere, translation
 
@@ -98,7 +107,7 @@ def test_spot_lights_its_cone_alone() -> None:
     assert (got[radius > edge + 1e-3] == 0).all()
     inside = radius < edge - 1e-3
     assert got[inside] == pytest.approx(100 * 2 / (4 * np.pi * (radius[inside] ** 2 + 4) ** 1.5), rel=1e-4)
-    _, rays = lamp_irradiance(light, 0, rig.frame, shadows_of(rig), rig.workers, samples=1, seed=0)
+    _, rays = direct_irradiance((light,), rig.frame, shadows_of(rig), rig.workers, samples=1, seed=0)
     assert rays == inside.sum()
 
 
@@ -205,3 +214,29 @@ def test_threads_and_seeds() -> None:
     other = make_rig(soft, atlas).direct(4, seed=1)
     assert not np.array_equal(one, other)
     assert other.mean() == pytest.approx(one.mean(), rel=0.02)
+
+
+@pytest.mark.parametrize("name", LAMPS)
+@pytest.mark.parametrize("samples", [1, 5])
+@pytest.mark.parametrize("opacity", [1.0, 0.3])
+def test_any_of_the_texels_alone_get_the_same_bits(name: str, samples: int, opacity: float) -> None:
+    """However few are asked for, in whatever order and chunks."""
+    scene, atlas = cornell(16)
+    tilted = translation(0.3, -0.4, 1.6)
+    tilted[:3, :3] = [[1, 0, 0], [0, 0.8, -0.6], [0, 0.6, 0.8]]  # its light comes in by the open front
+    lamp = replace(LAMPS[name], matrix_world=tilted)
+    looks = (replace(scene.materials[0], opacity=opacity), *scene.materials[1:])
+    rig = make_rig(replace(scene, lights=(lamp,), materials=looks), atlas, threads=2)
+    shadows, rng = shadows_of(rig), np.random.default_rng(samples)
+    receivers = make_receivers(rig.frame, rig.geometry, samples=samples)
+    whole = direct_irradiance((lamp,), rig.frame, shadows, rig.workers, samples=samples, seed=3)[0]
+    assert (whole > 0).any()
+    for count in (1, 2, 3, 17, 500):
+        texels = rng.choice(rig.texels.count, count, replace=False).astype(np.int32)
+        strength, _ = lamp_irradiance(lamp, 0, texels, receivers, shadows, rig.workers, seed=3)
+        assert irradiance_of(lamp, strength).tobytes() == whole[texels].tobytes()
+        part = make_receivers(rig.frame, rig.geometry, samples=samples, texels=texels)
+        assert part.offset.tobytes() == receivers.offset[texels].tobytes()
+        assert part.reach.tobytes() == receivers.reach[texels].tobytes()
+        seen = reached(lamp, receivers, rig.geometry.origin)
+        assert np.array_equal(reached(lamp, receivers, rig.geometry.origin, texels), seen[texels])

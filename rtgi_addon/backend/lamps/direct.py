@@ -14,7 +14,7 @@ import numpy as np
 
 from ..parallel import CHUNK_RAYS, Workers
 from ..sampling import dot, stratified_pair, unit_float32
-from ..scene import Float32, Int32, Light, LightKind, Material
+from ..scene import Bool, Float32, Float64, Int32, Light, LightKind, Material
 from ..surface.geometry import Geometry
 from ..surface.texels import TexelFrame
 from ..surface.tracing import Tracer
@@ -72,58 +72,85 @@ def make_shadows(tracer: Tracer, geometry: Geometry, materials: Sequence[Materia
     return Shadows(tracer, geometry, transparency if np.any(transparency > 0) else None)
 
 
+@dataclass(frozen=True)
+class Receivers:
+    """n texels of one frame and where their shadow rays start."""
+
+    frame: TexelFrame
+    samples: int  # rays of a texel to a lamp: one starts at its position, several at points of its footprint
+    offset: Float32  # (n,) m that rays are lifted off the surface
+    reach: Float32  # (n,) m from the position, within which they start
+
+
+def make_receivers(
+    frame: TexelFrame, geometry: Geometry, *, samples: int, texels: Int32 | slice = slice(None)
+) -> Receivers:
+    """``offset`` and ``reach`` are those of ``texels``."""
+    position = frame.position[texels]
+    offset = geometry.offset_length(position)
+    if samples == 1:
+        return Receivers(frame, samples, offset, offset)
+    away = frame.points[texels] - position[:, None]
+    away *= away
+    squared = away[..., 0] + away[..., 1] + away[..., 2]
+    return Receivers(frame, samples, offset, offset + np.sqrt(squared.max(axis=1, initial=0)))
+
+
 def direct_irradiance(
     lights: Sequence[Light], frame: TexelFrame, shadows: Shadows, workers: Workers, *, samples: int, seed: int
 ) -> tuple[Float32, int]:
     """((n, 3) W/m², rays traced) from all lamps together, on the texels of ``frame``."""
     total = np.zeros((len(frame.position), 3), np.float32)
+    receivers = make_receivers(frame, shadows.geometry, samples=samples)
     rays = 0
     for number, light in enumerate(lights):
         if not is_dark(light):
-            strength, traced = lamp_irradiance(light, number, frame, shadows, workers, samples=samples, seed=seed)
-            total += strength[:, None] * np.maximum(np.asarray(light.power, np.float32), 0)
+            texels = np.nonzero(reached(light, receivers, shadows.geometry.origin))[0].astype(np.int32)
+            strength, traced = lamp_irradiance(light, number, texels, receivers, shadows, workers, seed=seed)
+            total[texels] += irradiance_of(light, strength)
             rays += traced
     return total, rays
 
 
+def irradiance_of(light: Light, strength: Float32) -> Float32:
+    """(k, 3) W/m² where ``light`` gives ``strength`` (k,) 1/m² per unit of its power."""
+    return np.asarray(strength[:, None] * np.maximum(np.asarray(light.power, np.float32), 0))
+
+
+def reached(light: Light, receivers: Receivers, origin: Float64, texels: Int32 | slice = slice(None)) -> Bool:
+    """(k,) could ``light`` reach each of ``texels`` (k,), were nothing in its way? Those that it cannot cost no ray."""
+    frame = receivers.frame
+    position, reach = frame.position[texels], receivers.reach[texels]
+    seen = may_see(light, position, frame.normal[texels], reach, origin=origin)
+    return seen & may_see(light, position, frame.geometric_normal[texels], reach, origin=origin)
+
+
 def lamp_irradiance(
-    light: Light, number: int, frame: TexelFrame, shadows: Shadows, workers: Workers, *, samples: int, seed: int
+    light: Light, number: int, texels: Int32, receivers: Receivers, shadows: Shadows, workers: Workers, *, seed: int
 ) -> tuple[Float32, int]:
-    """((n,) 1/m², rays traced): irradiance of each texel per unit of ``light.power``; ``number`` seeds its samples."""
-    geometry = shadows.geometry
-    origin = geometry.origin
-    offset = geometry.offset_length(frame.position)
-    reach = offset
-    if samples > 1:
-        reach = reach + _length(frame.points - frame.position[:, None]).max(axis=1)
-    lit = may_see(light, frame.position, frame.normal, reach, origin=origin)
-    lit &= may_see(light, frame.position, frame.geometric_normal, reach, origin=origin)
-    texels = np.nonzero(lit)[0].astype(np.int32)
-    out = np.zeros(len(frame.position), np.float32)
+    """((k,) 1/m², rays traced): irradiance of ``texels`` (k,) per unit of ``light.power``.
+
+    ``number`` seeds its samples. A texel gets the same bits whichever others are asked for with it; one that is not
+    :func:`reached` gets nothing.
+    """
 
     def part(rows: slice) -> tuple[Float32, int]:
-        return _sampled(light, number, frame, texels[rows], offset, shadows, samples, seed)
+        return _sampled(light, number, texels[rows], receivers, shadows, seed)
 
-    done = workers.map_slices(part, len(texels), max(1, CHUNK_RAYS // samples))
-    if done:
-        out[texels] = np.concatenate([d[0] for d in done])
-    return out, sum(d[1] for d in done)
+    done = workers.map_slices(part, len(texels), max(1, CHUNK_RAYS // receivers.samples))
+    if not done:
+        return np.zeros(0, np.float32), 0
+    return np.concatenate([d[0] for d in done]), sum(d[1] for d in done)
 
 
 def _sampled(
-    light: Light,
-    number: int,
-    frame: TexelFrame,
-    texels: Int32,
-    offset: Float32,
-    shadows: Shadows,
-    samples: int,
-    seed: int,
+    light: Light, number: int, texels: Int32, receivers: Receivers, shadows: Shadows, seed: int
 ) -> tuple[Float32, int]:
     """((k,) 1/m², rays) for the texels (k,) of one chunk."""
+    frame, samples = receivers.frame, receivers.samples
     keys = texels.astype(np.uint32)
     of_ray = np.repeat(texels, samples)
-    lift = offset[of_ray]
+    lift = receivers.offset[of_ray]
     points = frame.position[of_ray] + frame.geometric_normal[of_ray] * lift[:, None]
     if samples > 1:
         x, _ = (unit_float32(n).reshape(-1) for n in stratified_pair(keys, samples, pair=2 * number, seed=seed))
@@ -148,7 +175,3 @@ def _sampled(
 def _far(geometry: Geometry) -> float:
     """m: longer than any ray within the scene."""
     return 4 * geometry.extent + 1
-
-
-def _length(vectors: Float32) -> Float32:
-    return np.asarray(np.sqrt(np.einsum("...i,...i->...", vectors, vectors)))
