@@ -188,6 +188,32 @@ def test_the_command_writes_one_file_and_says_where(tmp_path: Path, capfd: pytes
     assert events[-1]["bytes"] == len(first)
 
 
+def test_a_real_bake_is_reported(tmp_path: Path, add_cube: Callable[..., bpy.types.Object]) -> None:
+    room = add_cube("Room", size=4.0)
+    room.data.flip_normals()
+    block = add_cube("Block", location=(0.5, 0.0, -1.0))
+    for frame in (1, 2):
+        block.location.x = 0.5 * frame
+        block.keyframe_insert("location", frame=frame)
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
+    lamp.location, lamp.data.energy = (0, 0, 1.5), 100
+    bpy.context.scene.collection.objects.link(lamp)
+    bpy.ops.wm.save_as_mainfile(filepath=str(tmp_path / "room.blend"))
+    maps = tmp_path / "maps"
+    flags = ("--frames", "1-2", "--resolution", "48", "--quality", "draft")
+    assert run(["bake", str(tmp_path / "room.blend"), "--out", str(maps), *flags]) == 0
+    summary = report(maps)
+    text = summary.out.read_text(encoding="utf-8")
+    assert summary.frames == 2
+    assert "resolution 48, quality draft" in text and "2 objects" in text
+    assert all(f"<b>{title}</b>" in text for title in ("Time by stage", "Estimated error", "Rays", "Links", "Texels"))
+    found = pictures(summary.out, tmp_path)
+    assert {key[1] for key in found} == {"IIM", "AIM", "Change"}
+    assert found[0, "IIM", "iim.p0.0001.exr"][..., :3].max() > 0.5
+    (change,) = [picture for key, picture in found.items() if key[1] == "Change"]
+    assert change[..., 3].max() > 0.9  # the block moved, and took its shadow along
+
+
 def test_the_open_scene_stays_as_it_is(tmp_path: Path, add_cube: Callable[..., bpy.types.Object]) -> None:
     add_cube()
     folder = bake_folder(tmp_path / "maps")
