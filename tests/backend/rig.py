@@ -11,7 +11,8 @@ from rtgi_addon.backend.lamps.direct import direct_irradiance, make_shadows
 from rtgi_addon.backend.lamps.emission import PhotonSource, all_photons, make_bounds, make_sources, photon_counts
 from rtgi_addon.backend.lamps.lights import Bounds
 from rtgi_addon.backend.parallel import Workers
-from rtgi_addon.backend.photon.photons import EnergyBook, PhotonPaths, trace_photons
+from rtgi_addon.backend.photon.paths import EnergyBook, PhotonPaths
+from rtgi_addon.backend.photon.photons import trace_photons
 from rtgi_addon.backend.photon.scatter import Surfaces, make_surfaces
 from rtgi_addon.backend.scene import Atlas, FrameState, Scene
 from rtgi_addon.backend.surface.geometry import Geometry

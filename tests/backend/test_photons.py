@@ -13,7 +13,15 @@ from hypothesis import strategies as st
 from rtgi_addon.backend.lamps.emission import all_photons, photon_counts
 from rtgi_addon.backend.photon import photons as ph
 from rtgi_addon.backend.photon.photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits
-from rtgi_addon.backend.photon.photons import END_ABSORBED, END_CUT, END_ESCAPED, PhotonPaths, join_paths, take_paths
+from rtgi_addon.backend.photon.paths import (
+    BACK,
+    END_ABSORBED,
+    END_CUT,
+    END_ESCAPED,
+    PhotonPaths,
+    join_paths,
+    take_paths,
+)
 from rtgi_addon.backend.photon.scatter import choose, reflect, refract
 from rtgi_addon.backend.scene import Atlas, Instance, Material, Scene
 from tests.backend.rig import make_rig
@@ -131,7 +139,7 @@ def test_light_from_behind_lands_on_the_back() -> None:
     wall = quad("wall", [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)])
     scene = scene_of(wall, materials=(BLACK,), lights=(point_light((0, 0, -1), 100),))
     paths, _ = make_rig(scene, grid_atlas(scene, [(4, 4)], back=(0,))).photons(1_000)
-    assert ((paths.flags & ph.BACK) > 0).all() and (paths.texel >= 16).all()
+    assert ((paths.flags & BACK) > 0).all() and (paths.texel >= 16).all()
 
 
 def test_paths_are_whole() -> None:

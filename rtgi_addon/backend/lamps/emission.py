@@ -8,13 +8,14 @@ all emissive meshes together are MESHES, the sky is SKY. Photons of the last two
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from hashlib import blake2b
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sampling import Discrete, make_discrete, sample_cosine_about, sample_triangle
+from ..sampling import Discrete, Floats, make_discrete, sample_cosine_about, sample_triangle
 from ..scene import Bool, Float32, Float64, FrameState, Int32, Light, Material, Scene
 from ..surface.geometry import Geometry
 from ..surface.texels import sample_map
@@ -45,6 +46,11 @@ class PhotonSource(Protocol):
         """(3,) W sent out; for sources with a map an estimate, used to share out photons."""
         ...
 
+    @property
+    def identity(self) -> bytes:
+        """The same for sources that send out the same photons: then nothing of them need be looked at again."""
+        ...
+
     def emit(self, numbers: list[Float64]) -> Emission:
         """One photon for each of the numbers (EMISSION_DIMENSIONS arrays (n,) in [0, 1))."""
         ...
@@ -62,6 +68,10 @@ class LampSource:
     @property
     def flux(self) -> Float64:
         return lamp_flux(self.lamp, self.bounds)
+
+    @property
+    def identity(self) -> bytes:
+        return lamp_identity(self.lamp, self.origin, self.bounds)
 
     def emit(self, numbers: list[Float64]) -> Emission:
         return emit_lamp(self.lamp, numbers, origin=self.origin, bounds=self.bounds)
@@ -83,6 +93,10 @@ class SkySource:
         return np.asarray(
             (self.sky.radiance * self.sky.solid_angle[:, None]).sum(axis=0, dtype=np.float64) * mean_outline
         )
+
+    @property
+    def identity(self) -> bytes:
+        return fingerprint(self.sky.radiance, self.sky.rows, self.odds.cdf, self.bounds.low, self.bounds.high)
 
     def emit(self, numbers: list[Float64]) -> Emission:
         patch, across = self.odds.sample(numbers[0])
@@ -108,6 +122,11 @@ class MeshSource:
     flux: Float64  # (3,) W
     light: int = MESHES
 
+    @property
+    def identity(self) -> bytes:
+        corners, normals = self.geometry.corners[self.triangle], self.geometry.normals[self.triangle]
+        return fingerprint(self.triangle, self.back, self.emission, self.odds.cdf, corners, normals)
+
     def emit(self, numbers: list[Float64]) -> Emission:
         entry, _ = self.odds.sample(numbers[4])
         triangle = self.triangle[entry]
@@ -127,7 +146,7 @@ def make_sources(
 ) -> list[PhotonSource]:
     """All sources that send anything out. ``sides`` (instances, 2): does the front, the back send light (default all)?
 
-    ``bounds`` must hold everything that light can hit; keep it over the frames, since sun and sky photons start on it.
+    ``bounds`` must hold everything that light can hit (:func:`grown_bounds`).
     """
     sources: list[PhotonSource] = []
     for number, lamp in enumerate(state.lights):
@@ -139,7 +158,7 @@ def make_sources(
     sky = make_sky(state.world)
     if sky is not None and not bounds.is_empty:
         weights = np.maximum(sky.radiance.max(axis=1), 0) * sky.solid_angle
-        sources.append(SkySource(sky, bounds, make_discrete(weights)))
+        sources.append(SkySource(sky, bounds, steady_odds(weights)))
     return sources
 
 
@@ -156,27 +175,70 @@ def make_bounds(geometry: Geometry) -> Bounds:
     return Bounds(low - margin, high + margin)
 
 
-def grown_bounds(bounds: Bounds, geometry: Geometry) -> Bounds:
-    """``bounds`` itself while it holds all triangles, else a box for both. Sun and sky photons start on the box, so one
-    that stays the same keeps their paths."""
+def grown_bounds(base: Bounds, geometry: Geometry) -> Bounds:
+    """``base`` itself while it holds all triangles of ``geometry``, else each side moved out as far as it must be.
+
+    Sun and sky photons start on the box, so one that stays the same keeps their paths: sides move by the base's
+    diagonal over 16, over 8, over 4 and so on. A function of its arguments alone: give it the session's first box in
+    every frame, never the last result.
+    """
     now = make_bounds(geometry)
-    if bounds.is_empty or now.is_empty:
-        return now if bounds.is_empty else bounds
+    if base.is_empty or now.is_empty:
+        return now if base.is_empty else base
     # The margin of `now` is not demanded: else a scene that only breathes would move the box in every frame.
     slack = (now.high - now.low).max() * 1e-4
-    if np.all(now.low >= bounds.low - slack) and np.all(now.high <= bounds.high + slack):
-        return bounds
-    return Bounds(np.minimum(bounds.low, now.low), np.maximum(bounds.high, now.high))
+    step = float(np.sqrt(((base.high - base.low) ** 2).sum())) / 16
+
+    def outset(missing: Float64) -> Float64:
+        doublings = np.ceil(np.log2(np.maximum(missing / step, 1)))
+        return np.where(missing > slack, step * 2.0**doublings, 0)
+
+    low, high = outset(base.low - now.low), outset(now.high - base.high)
+    return Bounds(base.low - low, base.high + high) if np.any(low) or np.any(high) else base
 
 
 def photon_counts(sources: Sequence[PhotonSource], total: int) -> dict[int, int]:
-    """Photons of each light, by its brightest channel; every source gets at least one, so none is lost."""
+    """Photons of each light, by its brightest channel; every source gets at least one, so none is lost.
+
+    Lights are weighed by the power of two next to their flux, each alone: while none passes from one power to the
+    next, no count changes, so a light that dims keeps its photons and leaves the others theirs. Passing one moves
+    photons from it to the others or back: these alone are traced. The price is that a light may get from half to twice
+    its share; the total stays.
+    """
     flux = np.array([max(s.flux) for s in sources])
     if not len(flux):
         return {}
-    share = np.maximum(np.floor(flux / flux.sum() * total), 1).astype(np.int64)
-    share[int(np.argmax(flux))] += max(total - int(share.sum()), 0)
+    weight = np.where(flux > 0, 2.0 ** np.rint(np.log2(np.maximum(flux, 1e-300))), 0)
+    if not weight.any():
+        weight[:] = 1
+    share = np.maximum(np.floor(weight / weight.sum() * total), 1).astype(np.int64)
+    share[int(np.argmax(weight))] += max(total - int(share.sum()), 0)
     return {s.light: int(n) for s, n in zip(sources, share, strict=True)}
+
+
+def steady_odds(weights: Floats) -> Discrete:
+    """Odds in proportion to ``weights`` (m,) to 3 %: rounded, so that they stay the same bits when all weights are
+    multiplied by one number. Raises ValueError where none is positive."""
+    largest = weights.max(initial=0)
+    if not largest > 0:
+        raise ValueError("weights: at least one must be positive")
+    mantissa, exponent = np.frexp(weights.astype(np.float64) / float(largest))
+    return make_discrete(np.ldexp(np.rint(mantissa * 32) / 32, exponent))
+
+
+def fingerprint(*parts: object) -> bytes:
+    """16 bytes that differ where any of ``parts`` (arrays, numbers, strings, tuples of numbers) differs."""
+    digest = blake2b(digest_size=16)
+    for part in parts:
+        array = np.asarray(part)
+        digest.update(f"{array.dtype.str}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.digest()
+
+
+def lamp_identity(lamp: Light, origin: Float64, bounds: Bounds, *more: object) -> bytes:
+    """Of a lamp with everything else that its photons depend on."""
+    return fingerprint(*(getattr(lamp, f.name) for f in fields(lamp)), origin, bounds.low, bounds.high, *more)
 
 
 def all_photons(counts: dict[int, int]) -> tuple[Int32, Int64]:
@@ -204,7 +266,7 @@ def _mesh_source(scene: Scene, state: FrameState, geometry: Geometry, sides: Boo
     base = np.array([m.emission for m in materials], np.float32)[geometry.material_of_triangle[triangle]]
     back = np.repeat([False, True], [len(r) for r in rows])
     return MeshSource(
-        scene, geometry, triangle, back, base, area, make_discrete(flux.max(axis=1)), np.asarray(flux.sum(axis=0))
+        scene, geometry, triangle, back, base, area, steady_odds(flux.max(axis=1)), np.asarray(flux.sum(axis=0))
     )
 
 

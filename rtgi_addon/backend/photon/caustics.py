@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lamps.emission import PhotonSource, all_photons, photon_counts
+from ..lamps.emission import PhotonSource, all_photons, lamp_identity, photon_counts
 from ..lamps.lights import (
     FULL_SPREAD,
     Bounds,
@@ -32,12 +32,13 @@ from ..lamps.lights import (
 from ..parallel import Workers
 from ..progress import Report, silent
 from ..sampling import make_discrete, photon_numbers, sample_cone, to_frame, unit_float64
-from ..scene import Float32, Float64, FrameState, Light, LightKind, Material, Scene
+from ..scene import Bool, Float32, Float64, FrameState, Light, LightKind, Material, Scene
 from ..surface.geometry import Geometry
 from ..surface.texels import TexelFrame, Texels
 from ..surface.tracing import Tracer
+from .paths import EnergyBook, PhotonPaths, take_paths
 from .photon_map import caustic_hits, make_photon_map, photon_irradiance
-from .photons import EnergyBook, PhotonPaths, take_paths, trace_photons
+from .photons import trace_photons
 from .scatter import Surfaces
 
 #: More generators than this are taken as one sphere around all: the mixture's density costs one test for each.
@@ -69,6 +70,10 @@ class AimedSource:
         light = np.full(_FLUX_POINTS, self.light, np.int32)
         numbers = photon_numbers(light, np.arange(_FLUX_POINTS, dtype=np.uint32), 0)
         return np.asarray(self.emit([unit_float64(n) for n in numbers]).weight.mean(axis=0))
+
+    @property
+    def identity(self) -> bytes:
+        return lamp_identity(self.lamp, self.origin, self.bounds, self.generators.centre, self.generators.radius)
 
     def emit(self, numbers: list[Float64]) -> Emission:
         place = place_lamp(self.lamp, self.origin)
@@ -152,10 +157,21 @@ def trace_caustics(
     return take_paths(paths, np.nonzero(caustic)[0]), book
 
 
-def caustic_irradiance(paths: PhotonPaths, texels: Texels, frame: TexelFrame, workers: Workers, *, k: int) -> Float32:
-    """(n, 3) W/m² at each texel, from the hits of ``paths`` after their first mirror or glass."""
+def caustic_irradiance(
+    paths: PhotonPaths,
+    texels: Texels,
+    frame: TexelFrame,
+    workers: Workers,
+    *,
+    k: int,
+    surfaces: Bool | None = None,
+) -> Float32:
+    """(n, 3) W/m² at each texel, from the hits of ``paths`` after their first mirror or glass.
+
+    ``surfaces``: see :func:`~.photon_map.photon_irradiance`.
+    """
     photons = make_photon_map(paths, caustic_hits(paths))
-    return photon_irradiance(photons, texels, frame, workers, k=k)
+    return photon_irradiance(photons, texels, frame, workers, k=k, surfaces=surfaces)
 
 
 def _aimed_directions(

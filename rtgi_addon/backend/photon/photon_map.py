@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Irradiance from photons: the k nearest of the texel's own surface over the area they span (Larsen04 §3).
 
-One k-d tree holds all surfaces: a fourth coordinate keeps them so far apart that no search crosses from one to
-another, which is the paper's tree per surface with one call for all texels.
+One k-d tree for each surface, as in the paper: what a surface gets depends on its own photons and texels alone, so any
+subset of the surfaces computed alone gives the same bits.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +19,7 @@ from ..lamps.emission import MESHES, SKY
 from ..parallel import CHUNK_RAYS, Workers
 from ..scene import Bool, Float32, Float64, Int32
 from ..surface.texels import TexelFrame, Texels
-from .photons import AFTER_DIFFUSE, AFTER_SPECULAR, PhotonPaths
+from .paths import AFTER_DIFFUSE, AFTER_SPECULAR, PhotonPaths
 
 Rows = NDArray[np.int64]
 
@@ -62,8 +64,16 @@ def lamp_hits(paths: PhotonPaths) -> Bool:
     return ~np.isin(paths.light, (MESHES, SKY))[paths.path_of_hit]
 
 
-def photon_irradiance(photons: PhotonMap, texels: Texels, frame: TexelFrame, workers: Workers, *, k: int) -> Float32:
-    """(n, 3) W/m² at each texel.
+def photon_irradiance(
+    photons: PhotonMap,
+    texels: Texels,
+    frame: TexelFrame,
+    workers: Workers,
+    *,
+    k: int,
+    surfaces: Bool | None = None,
+) -> Float32:
+    """(n, 3) W/m² at each texel; zero off the chosen ``surfaces`` (surface_count,), None for all.
 
     The farthest of the k photons only sets the radius: counting it too would make the estimate too bright by
     1/(k - 1) where photons lie evenly. A surface with no more than k photons gets their flux over its whole area; a
@@ -71,16 +81,39 @@ def photon_irradiance(photons: PhotonMap, texels: Texels, frame: TexelFrame, wor
     """
     out = np.zeros((texels.count, 3), np.float32)
     surface = texels.surface[photons.texel]
+    if surfaces is not None:
+        kept = np.nonzero(surfaces[surface])[0]
+        surface = surface[kept]
+        photons = PhotonMap(photons.position[kept], photons.flux[kept], photons.texel[kept])
     count = np.bincount(surface, minlength=texels.surface_count)
-    few = count <= k
-    rows = np.nonzero(few[texels.surface] & (count[texels.surface] > 0))[0]
+    rows = np.nonzero(((count > 0) & (count <= k))[texels.surface])[0]
     if len(rows):
         area = np.bincount(texels.surface, frame.area, minlength=texels.surface_count)
         out[rows] = _mean_irradiance(photons.flux, surface, np.asarray(area, np.float64))[texels.surface[rows]]
-    rows = np.nonzero(~few[texels.surface])[0]
-    if len(rows):
-        out[rows] = _nearest(photons, surface, texels, frame, workers, rows, k)
+    many = np.nonzero(count > k)[0]
+    if not len(many):
+        return out
+    per_texel = _mean_irradiance(photons.flux, photons.texel, frame.area.astype(np.float64))
+    border = np.zeros(texels.count, np.bool_)
+    border[_border_texels(texels)] = True
+    photons_of, texels_of = _members(surface, texels.surface_count), _members(texels.surface, texels.surface_count)
+    inner = 1 if len(many) >= workers.count else workers.count
+
+    def one(place: slice) -> None:
+        number = int(many[place.start])
+        mine, rows = photons_of(number), texels_of(number)
+        patch = _Patch(frame.position[rows].astype(np.float64), frame.area[rows].astype(np.float64), border[rows])
+        out[rows] = _nearest(photons.position[mine], photons.flux[mine], patch, per_texel[rows], k, inner)
+
+    workers.map_slices(one, len(many), 1)
     return out
+
+
+def _members(surface: Int32, surface_count: int) -> Callable[[int], Rows]:
+    """The rows of each surface, in order."""
+    order = np.argsort(surface, kind="stable")
+    first = np.concatenate([[0], np.cumsum(np.bincount(surface, minlength=surface_count))])
+    return lambda number: order[first[number] : first[number + 1]]
 
 
 def _mean_irradiance(flux: Float32, bin_of_photon: Int32, area: Float64) -> Float64:
@@ -89,59 +122,53 @@ def _mean_irradiance(flux: Float32, bin_of_photon: Int32, area: Float64) -> Floa
     return np.divide(total, area[:, None], out=np.zeros_like(total), where=area[:, None] > 0)
 
 
-def _nearest(
-    photons: PhotonMap, surface: Int32, texels: Texels, frame: TexelFrame, workers: Workers, rows: Rows, k: int
-) -> Float64:
-    """(m, 3) for texels ``rows`` (m,), whose surfaces have more than k photons."""
-    apart = 4.0 * float(np.ptp(frame.position, axis=0).max()) + 1e-6
-    tree = cKDTree(_with_surface(photons.position, surface, apart))
-    places = _with_surface(frame.position[rows], texels.surface[rows], apart)
-    distance, nearest = tree.query(places, k=k, workers=workers.count)
+@dataclass(frozen=True)
+class _Patch:
+    """The t texels of one surface."""
+
+    position: Float64  # (t, 3) local
+    area: Float64  # (t,) m²
+    border: Bool  # (t,)
+
+
+def _nearest(position: Float32, flux: Float32, patch: _Patch, per_texel: Float64, k: int, threads: int) -> Float64:
+    """(t, 3) for the texels of a surface with more than k photons at ``position`` (m, 3)."""
+    distance, nearest = cKDTree(position.astype(np.float64)).query(patch.position, k=k, workers=threads)
     radius = distance[:, -1]
-    flux = _sums(photons.flux, nearest[:, :-1], workers)
     disk = np.pi * radius * radius
-    texel_area = frame.area[rows].astype(np.float64)
-    wide = disk > texel_area
-    disk *= _share_on_surface(texels, frame, workers, rows, np.where(wide, radius, 0), apart)
+    wide = disk > patch.area
+    disk *= _share_on_surface(patch, np.where(wide, radius, 0), threads)
     # k photons at one point, on a surface without extent: nothing to spread them over.
     solid = (disk > np.finfo(np.float32).tiny)[:, None]
-    out = np.divide(flux, disk[:, None], out=np.zeros_like(flux), where=solid)
-    per_texel = _mean_irradiance(photons.flux, photons.texel, frame.area.astype(np.float64))
-    return np.where(wide[:, None], out, per_texel[rows])
+    total = _sums(flux, nearest[:, :-1])
+    out = np.divide(total, disk[:, None], out=np.zeros_like(total), where=solid)
+    return np.where(wide[:, None], out, per_texel)
 
 
-def _sums(flux: Float32, nearest: Rows, workers: Workers) -> Float64:
-    """(m, 3) sums of ``flux`` over each row of ``nearest`` (m, k)."""
-
-    def part(rows: slice) -> Float64:
-        return np.asarray(flux.take(nearest[rows], axis=0).sum(axis=1, dtype=np.float64))
-
-    return np.concatenate(workers.map_slices(part, len(nearest), max(1, CHUNK_RAYS // nearest.shape[1])))
+def _sums(flux: Float32, nearest: Rows) -> Float64:
+    """(t, 3) sums of ``flux`` over each row of ``nearest`` (t, k)."""
+    step = max(1, CHUNK_RAYS // nearest.shape[1])
+    parts = [nearest[first : first + step] for first in range(0, len(nearest), step)]
+    return np.concatenate([flux.take(part, axis=0).sum(axis=1, dtype=np.float64) for part in parts])
 
 
-def _share_on_surface(
-    texels: Texels, frame: TexelFrame, workers: Workers, rows: Rows, radius: Float64, apart: float
-) -> Float64:
-    """(m,) share of the disk of ``radius`` about each of ``rows`` that lies on its surface; less than 1 near a border.
+def _share_on_surface(patch: _Patch, radius: Float64, threads: int) -> Float64:
+    """(t,) share of the disk of ``radius`` about each texel that lies on the surface; less than 1 near a border.
 
     Counted in texels of the surface within the disk, against those of an endless square grid.
     """
-    share = np.ones(len(rows))
-    number = np.bincount(texels.surface, minlength=texels.surface_count)
-    area = np.bincount(texels.surface, frame.area, minlength=texels.surface_count)
-    width = np.sqrt(area / np.maximum(number, 1))[texels.surface[rows]]
-    places = _with_surface(frame.position, texels.surface, apart)
-    border = _border_texels(texels)
-    to_border, _ = cKDTree(places[border]).query(places[rows], workers=workers.count)
-    near = np.nonzero((radius > 0) & (width > 0) & (to_border < radius + width))[0]
-    if not len(near):
+    share = np.ones(len(radius))
+    width = float(np.sqrt(patch.area.sum() / len(radius)))
+    to_border, _ = cKDTree(patch.position[patch.border]).query(patch.position, workers=threads)
+    near = np.nonzero((radius > 0) & (to_border < radius + width))[0]
+    if not len(near) or width <= 0:
         return share
-    tree = cKDTree(places, leafsize=32)
+    tree = cKDTree(patch.position, leafsize=32)
     counted, expected = np.zeros(len(near)), np.zeros(len(near))
     for step in _COUNT_AT:
-        reach = radius[near] + step * width[near]
-        counted += tree.query_ball_point(places[rows[near]], reach, return_length=True, workers=workers.count)
-        expected += _grid_points(reach / width[near])
+        reach = radius[near] + step * width
+        counted += tree.query_ball_point(patch.position[near], reach, return_length=True, workers=threads)
+        expected += _grid_points(reach / width)
     share[near] = np.minimum(counted / expected, 1)
     return share
 
@@ -157,12 +184,12 @@ def _border_texels(texels: Texels) -> Rows:
 
 def _grid_points(radius: Float64) -> Float64:
     """(m,) points of the unit grid within ``radius`` of one of them."""
-    steps = np.arange(-_COUNTED_WIDTHS, _COUNTED_WIDTHS + 1)
-    squares = np.sort(np.add.outer(steps * steps, steps * steps).ravel())
-    counted = np.searchsorted(squares, radius * radius, side="right")
+    counted = np.searchsorted(_grid_distances(), radius * radius, side="right")
     return np.where(radius < _COUNTED_WIDTHS, counted, np.pi * radius * radius)
 
 
-def _with_surface(position: Float32, surface: Int32, apart: float) -> Float64:
-    """(m, 4) positions with the surface's number, times ``apart`` m, as fourth coordinate."""
-    return np.concatenate([position.astype(np.float64), surface[:, None] * apart], axis=1)
+@lru_cache(maxsize=1)
+def _grid_distances() -> Rows:
+    """Squared distances of the unit grid's points from one of them, in order."""
+    steps = np.arange(-_COUNTED_WIDTHS, _COUNTED_WIDTHS + 1)
+    return np.sort(np.add.outer(steps * steps, steps * steps).ravel())

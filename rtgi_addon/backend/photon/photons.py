@@ -2,8 +2,9 @@
 """Photon tracing (Larsen04 §2): every photon's path through the scene, kept whole in arrays.
 
 A photon's path depends on (light, index, seed) and the scene alone, so :func:`trace_photons` on a subset gives the
-same bits as tracing all. The loop runs over bounces only. Lambertian surfaces send light back about their geometric
-normal (what leaves them is then what the gather sees of them); mirrors and glass use the shading normal.
+same bits as tracing all. It does not depend on how bright its light is: photons fly with unit flux and are scaled at
+the end. The loop runs over bounces only. Lambertian surfaces send light back about their geometric normal (what leaves
+them is then what the gather sees of them); mirrors and glass use the shading normal.
 """
 
 from __future__ import annotations
@@ -21,76 +22,45 @@ from ..progress import Report, silent
 from ..sampling import photon_numbers, unit_float32, unit_float64
 from ..scene import Float32, Float64, Int32
 from ..surface.tracing import Hits, Tracer
+from .paths import (
+    AFTER_DIFFUSE,
+    AFTER_SPECULAR,
+    BACK,
+    END_ABSORBED,
+    END_CUT,
+    END_ESCAPED,
+    EnergyBook,
+    PhotonPaths,
+    UInt8,
+    energy_book,
+    join_paths,
+    scaled_paths,
+)
 from .scatter import ABSORBED, Surfaces, scatter
-
-UInt8 = NDArray[np.uint8]
-
-#: Flags of a hit. Light that only went straight through (opacity) has none of the first two.
-AFTER_DIFFUSE = np.uint8(1)  # reflected diffusely before this hit
-AFTER_SPECULAR = np.uint8(2)  # reflected by a mirror or refracted before this hit
-BACK = np.uint8(4)  # landed on the back side
 
 _FLAG_OF_KIND = np.array([AFTER_DIFFUSE, AFTER_SPECULAR, AFTER_SPECULAR, 0, 0], np.uint8)  # by scatter's kinds
 
-#: How a path ended.
-END_ABSORBED, END_ESCAPED, END_CUT = np.uint8(0), np.uint8(1), np.uint8(2)
-
 #: Photons traced together: smaller than other chunks, since ten arrays of them must stay in cache (measured).
 CHUNK_PHOTONS = 1 << 15
+_LEAST_CHUNK = 1 << 11  # below it a thread costs more than it brings
 _CHUNKS_PER_REPORT = 64
 
+#: A photon's path follows its colour in so many steps of each channel. Fewer steps: a light may change its colour more
+#: before paths change. More: the odds fit the colour better. Either way the estimate has no bias.
+GUIDE_STEPS = 16
+
 
 @dataclass(frozen=True)
-class PhotonPaths:
-    """p paths and their h hits; path i owns hits first_hit[i] to first_hit[i + 1], in order of bounce.
+class Starts:
+    """n photons as their lights send them out: ``guide`` * ``scale`` is a photon's flux times its light's count.
 
-    45 bytes a hit, 61 a path. ``flux`` is what arrives, before reflection.
+    A path follows from origin, direction and guide alone; the guide is the flux that it is traced with.
     """
 
-    light: Int32  # (p,) see ``emission``
-    index: Int64  # (p,) photon's number within its light
-    first_hit: Int64  # (p + 1,)
-    origin: Float32  # (p, 3) local, where the photon started
-    end: UInt8  # (p,) END_...
-    end_direction: Float32  # (p, 3) of travel at the end: where an escaped or cut photon goes
-    end_flux: Float32  # (p, 3) W carried at the end, 0 when absorbed
-    triangle: Int32  # (h,) scene-wide
-    texel: Int32  # (h,) -1 on a side without map
-    position: Float32  # (h, 3) local
-    direction: Float32  # (h, 3) unit, of travel before the hit
-    flux: Float32  # (h, 3) W
-    flags: UInt8  # (h,)
-
-    @property
-    def path_of_hit(self) -> Int32:
-        """(h,) path number of each hit."""
-        return np.repeat(np.arange(len(self.light), dtype=np.int32), np.diff(self.first_hit))
-
-    @property
-    def bounce_of_hit(self) -> Int32:
-        """(h,) 0 for the first hit of a path."""
-        return (np.arange(len(self.triangle)) - np.repeat(self.first_hit[:-1], np.diff(self.first_hit))).astype(
-            np.int32
-        )
-
-
-@dataclass(frozen=True)
-class EnergyBook:
-    """Where the flux went, (3,) W each: emitted = absorbed + escaped + cut, to rounding."""
-
-    emitted: Float64
-    absorbed: Float64  # of it `unlit`
-    unlit: Float64  # landed on a side that has no map and sends nothing back
-    escaped: Float64
-    cut: Float64  # still in flight after max_bounces hits
-    rays: int
-
-    @staticmethod
-    def total(books: Sequence[EnergyBook]) -> EnergyBook:
-        """The sum, in order."""
-        columns = ([getattr(b, f.name) for b in books] for f in fields(EnergyBook) if f.name != "rays")
-        emitted, absorbed, unlit, escaped, cut = (np.array(c).reshape(-1, 3).sum(axis=0) for c in columns)
-        return EnergyBook(emitted, absorbed, unlit, escaped, cut, sum(b.rays for b in books))
+    origin: Float32  # (n, 3) local
+    direction: Float32  # (n, 3) unit
+    guide: Float32  # (n, 3) brightest channel 1, in steps of 1 / GUIDE_STEPS; 0 for photons that carry nothing
+    scale: Float32  # (n, 3) W
 
 
 def trace_photons(
@@ -112,53 +82,73 @@ def trace_photons(
     ``counts`` (photons of each light) sets each photon's flux. ``emission.all_photons(counts)`` is everything. With
     ``diffuse`` False paths end where they are not mirrored, refracted or let through: caustics need no more.
     """
+    starts = emit_photons(sources, light, index, workers=workers, seed=seed)
+    paths, rays = trace_starts(
+        starts, light, index, surfaces=surfaces, tracer=tracer, workers=workers,
+        max_bounces=max_bounces, seed=seed, diffuse=diffuse, report=report,
+    )  # fmt: skip
+    paths = scaled_paths(paths, flux_factor(starts.scale, light, counts))
+    return paths, energy_book(paths, rays)
+
+
+def emit_photons(
+    sources: Sequence[PhotonSource], light: Int32, index: Int64, *, workers: Workers, seed: int = 0
+) -> Starts:
+    """Photons ``index`` (n,) of ``light`` (n,); those of a source that is no longer there carry nothing."""
     by_light = {s.light: s for s in sources}
+    parts = workers.map_slices(lambda s: _emit(by_light, light[s], index[s], seed), len(light), CHUNK_PHOTONS)
+    if len(parts) == 1:
+        return parts[0]
+    none = [np.zeros((0, 3), np.float32)]
+    return Starts(*(np.concatenate([getattr(p, f.name) for p in parts] or none) for f in fields(Starts)))
+
+
+def trace_starts(
+    starts: Starts,
+    light: Int32,
+    index: Int64,
+    *,
+    surfaces: Surfaces,
+    tracer: Tracer,
+    workers: Workers,
+    max_bounces: int,
+    seed: int = 0,
+    diffuse: bool = True,
+    report: Report = silent,
+) -> tuple[PhotonPaths, int]:
+    """Paths with the flux of their guides, and the number of rays they took."""
+
+    def trace_chunk(rows: slice) -> tuple[PhotonPaths, int]:
+        flight = _Flight(
+            np.arange(rows.stop - rows.start, dtype=np.int32), light[rows], index[rows].astype(np.uint32),
+            starts.origin[rows], starts.direction[rows], starts.guide[rows],
+            np.zeros(rows.stop - rows.start, np.uint8),
+        )  # fmt: skip
+        return _trace(flight, surfaces, tracer, max_bounces, seed, diffuse)
+
     paths: list[PhotonPaths] = []
-    books: list[EnergyBook] = []
-
-    def trace_chunk(rows: slice) -> tuple[PhotonPaths, EnergyBook]:
-        start = _start(by_light, counts, light[rows], index[rows], seed)
-        return _trace(start, surfaces, tracer, max_bounces, seed, diffuse)
-
-    step = CHUNK_PHOTONS * _CHUNKS_PER_REPORT
+    rays = 0
+    chunk = min(CHUNK_PHOTONS, max(_LEAST_CHUNK, -(-len(light) // workers.count)))
+    step = chunk * _CHUNKS_PER_REPORT
     for first in range(0, len(light), step):
         count = min(step, len(light) - first)
         done = workers.map_slices(
             lambda s, first=first: trace_chunk(slice(first + s.start, first + s.stop)),  # type: ignore[misc]
             count,
-            CHUNK_PHOTONS,
+            chunk,
         )
         paths += [d[0] for d in done]
-        books += [d[1] for d in done]
+        rays += sum(d[1] for d in done)
         report("photons", first + count, len(light))
-    return join_paths(paths), EnergyBook.total(books)
+    return join_paths(paths), rays
 
 
-def join_paths(parts: Sequence[PhotonPaths]) -> PhotonPaths:
-    """All paths of ``parts``, in order."""
-    parts = parts or [_gather_paths([], *_nothing())]
-    shift = np.cumsum([0] + [len(p.triangle) for p in parts])
-    first = [p.first_hit[:-1] + s for p, s in zip(parts, shift, strict=False)] + [shift[-1:]]
-    others = {
-        f.name: np.concatenate([getattr(p, f.name) for p in parts])
-        for f in fields(PhotonPaths)
-        if f.name != "first_hit"
-    }
-    return PhotonPaths(first_hit=np.concatenate(first).astype(np.int64), **others)
-
-
-def take_paths(paths: PhotonPaths, keep: NDArray[np.integer[Any]]) -> PhotonPaths:
-    """The paths ``keep`` (k,) of ``paths``, in that order."""
-    length = np.diff(paths.first_hit)[keep]
-    first = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-    hits = np.arange(first[-1]) + np.repeat(paths.first_hit[keep] - first[:-1], length)
-    path_fields = ("light", "index", "origin", "end", "end_direction", "end_flux")
-    hit_fields = ("triangle", "texel", "position", "direction", "flux", "flags")
-    return PhotonPaths(
-        first_hit=first,
-        **{name: getattr(paths, name)[keep] for name in path_fields},
-        **{name: getattr(paths, name)[hits] for name in hit_fields},
-    )
+def flux_factor(scale: Float32, light: Int32, counts: dict[int, int]) -> Float32:
+    """(n, 3) W: the flux of a photon for each unit of its guide. ``scale`` (n, 3) of ``light`` (n,)."""
+    count = np.ones(len(light), np.float32)
+    for number in np.unique(light).tolist():
+        count[light == number] = counts.get(number, 1)
+    return np.asarray(scale / count[:, None], np.float32)
 
 
 @dataclass
@@ -186,16 +176,17 @@ class _Landing:
     path: Int32  # (k,) row in the chunk
     triangle: Int32
     texel: Int32
-    position: Float32
+    start: Float32
     direction: Float32
+    distance: Float32
     flux: Float32
     flags: UInt8
+    position: Float32
 
 
-def _start(by_light: dict[int, PhotonSource], counts: dict[int, int], light: Int32, index: Int64, seed: int) -> _Flight:
-    """Photons at their sources; those of a source that is no longer there carry nothing."""
+def _emit(by_light: dict[int, PhotonSource], light: Int32, index: Int64, seed: int) -> Starts:
     count = len(light)
-    origin, direction, flux = (np.zeros((count, 3), np.float32) for _ in range(3))
+    origin, direction, guide, scale = (np.zeros((count, 3), np.float32) for _ in range(4))
     direction[:, 2] = -1
     numbers = [unit_float64(n) for n in photon_numbers(light, index.astype(np.uint32), 0, seed=seed)]
     for number in np.unique(light).tolist():
@@ -204,34 +195,38 @@ def _start(by_light: dict[int, PhotonSource], counts: dict[int, int], light: Int
         rows = np.nonzero(light == number)[0]
         emission = by_light[number].emit([n[rows] for n in numbers])
         origin[rows], direction[rows] = emission.origin, emission.direction
-        flux[rows] = emission.weight / counts[number]
-    return _Flight(
-        np.arange(count, dtype=np.int32),
-        light,
-        index.astype(np.uint32),
-        origin,
-        direction,
-        flux,
-        np.zeros(count, np.uint8),
-    )
+        guide[rows], scale[rows] = _guides(emission.weight)
+    return Starts(origin, direction, guide, scale)
+
+
+def _guides(weight: Float64) -> tuple[Float32, Float32]:
+    """((n, 3), (n, 3)) guide and scale of photons of ``weight`` (n, 3) W.
+
+    The share of each channel is rounded, but never to nothing: its light would be lost.
+    """
+    brightest = np.maximum(np.maximum(weight[:, 0], weight[:, 1]), weight[:, 2])[:, None]
+    share = np.divide(weight, brightest, out=np.zeros(weight.shape), where=brightest > 0)
+    steps = np.where(share > 0, np.maximum(np.rint(share * GUIDE_STEPS), 1), 0)
+    guide = steps / GUIDE_STEPS
+    scale = np.divide(weight, guide, out=np.zeros(weight.shape), where=guide > 0)
+    return guide.astype(np.float32), scale.astype(np.float32)
 
 
 def _trace(
     flight: _Flight, surfaces: Surfaces, tracer: Tracer, max_bounces: int, seed: int, diffuse: bool
-) -> tuple[PhotonPaths, EnergyBook]:
+) -> tuple[PhotonPaths, int]:
     count = len(flight.path)
     light, index, origin = flight.light, flight.index.astype(np.int64), flight.origin
     end = np.full(count, END_ABSORBED, np.uint8)
-    end_direction, end_flux = flight.direction.copy(), np.zeros((count, 3), np.float32)
+    end_origin, end_direction, end_flux = origin.copy(), flight.direction.copy(), np.zeros((count, 3), np.float32)
     landings: list[_Landing] = []
-    emitted = flight.flux.sum(axis=0, dtype=np.float64)
-    absorbed, unlit = np.zeros(3), np.zeros(3)
     rays = 0
     flight.keep(np.nonzero(flight.flux.max(axis=1, initial=0) > 0)[0])
 
     def finish(rows: NDArray[np.integer[Any]], how: np.uint8) -> None:
         path = flight.path[rows]
-        end[path], end_direction[path], end_flux[path] = how, flight.direction[rows], flight.flux[rows]
+        end[path], end_origin[path] = how, flight.origin[rows]
+        end_direction[path], end_flux[path] = flight.direction[rows], flight.flux[rows]
 
     for bounce in range(1, max_bounces + 1):
         if not len(flight.path):
@@ -249,16 +244,11 @@ def _trace(
         after = scatter(
             surfaces, hits, landing.texel, landing.position, flight.direction, flight.flux, numbers, diffuse=diffuse
         )
-        gone = after.kind == ABSORBED
-        absorbed += (flight.flux - after.flux).sum(axis=0, dtype=np.float64)
-        unlit += flight.flux[gone & (landing.texel < 0)].sum(axis=0, dtype=np.float64)
         flight.origin, flight.direction, flight.flux = after.origin, after.direction, after.flux
         flight.flags = flight.flags | _FLAG_OF_KIND[after.kind]
-        flight.keep(np.nonzero(~gone)[0])
+        flight.keep(np.nonzero(after.kind != ABSORBED)[0])
     finish(np.arange(len(flight.path)), END_CUT)
-    escaped, cut = (end_flux[end == how].sum(axis=0, dtype=np.float64) for how in (END_ESCAPED, END_CUT))
-    paths = _gather_paths(landings, light, index, origin, (end, end_direction, end_flux))
-    return paths, EnergyBook(emitted, absorbed, unlit, escaped, cut, rays)
+    return _gather_paths(landings, light, index, origin, (end, end_origin, end_direction, end_flux)), rays
 
 
 def _land(flight: _Flight, hits: Hits, surfaces: Surfaces) -> _Landing:
@@ -266,15 +256,21 @@ def _land(flight: _Flight, hits: Hits, surfaces: Surfaces) -> _Landing:
         path=flight.path,
         triangle=hits.triangle,
         texel=surfaces.texel_of_hits(hits.triangle, hits.u, hits.v, hits.back),
-        position=flight.origin + flight.direction * hits.distance[:, None],
+        start=flight.origin,
         direction=flight.direction,
+        distance=hits.distance,
         flux=flight.flux,
         flags=flight.flags | np.where(hits.back, BACK, np.uint8(0)),
+        position=flight.origin + flight.direction * hits.distance[:, None],
     )
 
 
 def _gather_paths(
-    landings: list[_Landing], light: Int32, index: Int64, origin: Float32, ends: tuple[UInt8, Float32, Float32]
+    landings: list[_Landing],
+    light: Int32,
+    index: Int64,
+    origin: Float32,
+    ends: tuple[UInt8, Float32, Float32, Float32],
 ) -> PhotonPaths:
     """Hits of all bounces put in order of path: hit b of a path is its b-th, so each row's place is known."""
     length = np.zeros(len(light), np.int64)
@@ -295,17 +291,14 @@ def _gather_paths(
         first_hit=first,
         origin=origin,
         end=ends[0],
-        end_direction=ends[1],
-        end_flux=ends[2],
+        end_origin=ends[1],
+        end_direction=ends[2],
+        end_flux=ends[3],
         triangle=column("triangle", (total,), np.int32),
         texel=column("texel", (total,), np.int32),
-        position=column("position", (total, 3), np.float32),
+        start=column("start", (total, 3), np.float32),
         direction=column("direction", (total, 3), np.float32),
+        distance=column("distance", (total,), np.float32),
         flux=column("flux", (total, 3), np.float32),
         flags=column("flags", (total,), np.uint8),
     )
-
-
-def _nothing() -> tuple[Int32, Int64, Float32, tuple[UInt8, Float32, Float32]]:
-    vectors = np.zeros((0, 3), np.float32)
-    return np.zeros(0, np.int32), np.zeros(0, np.int64), vectors, (np.zeros(0, np.uint8), vectors, vectors)
