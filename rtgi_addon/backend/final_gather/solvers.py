@@ -25,6 +25,8 @@ Operator = Callable[[Float32], Float32]
 BASIS_SIZE = 24
 #: A new direction shorter than this share of the product it came from is rounding, not direction.
 BREAKDOWN = 1e-6
+#: A product whose part outside the basis is a smaller share than this has lost more than a digit of it.
+LOSS = 0.1
 #: A restart that leaves more than this share of the residual has met the limit of float32.
 STAGNATION = 0.7
 
@@ -58,7 +60,7 @@ def solve_fixed_point(
     The residual never grows, and no other method that uses as many products reaches a smaller one between restarts.
     ``start`` is a first guess, such as the frame before. Raises ValueError where b or a product is not finite.
     """
-    _require_finite(np.abs(b).max(axis=0, initial=0), "the right-hand side")
+    _require_finite(b.T, "the right-hand side")
     strands = Strands(group, len(b))
     unit, rhs = _scaled_to_one(strands, strands.to_columns(b))
     length = strands.norms(rhs)
@@ -100,7 +102,7 @@ def conjugate_gradients(
 
     group: as for ``solve_fixed_point``, but x = 0 in rows of -1.
     """
-    _require_finite(np.abs(b).max(axis=0, initial=0), "the right-hand side")
+    _require_finite(b.T, "the right-hand side")
     strands = Strands(group, len(b))
     unit, residual = _scaled_to_one(strands, strands.to_columns(b))
     squared = strands.dots(residual, residual)
@@ -140,7 +142,7 @@ def _gmres_cycle(
     squares = HessenbergLeastSquares(length)
     used = np.zeros(length.shape, np.intp)
     active = (length > target) & (used < limit)
-    basis = np.zeros((int(limit.max()), *residual.shape), np.float32)  # memory is taken as it is filled
+    basis = np.empty((int(limit.max()), *residual.shape), np.float32)  # only what is filled is read; most never is
     size = 0
     vector, last = residual, length
     while active.any():
@@ -159,15 +161,15 @@ def _gmres_cycle(
 def _orthogonal(strands: Strands, vector: Float32, basis: Float32) -> tuple[Float32, Float64, Float64]:
     """(``vector`` without its parts along the basis, (j, c, g) those parts, (c, g) the length of what is left).
 
-    Gram-Schmidt, and once more in strands whose length fell below 1 / sqrt(2), where float32 has lost too much
-    (Daniel, Gragg, Kaufman and Stewart 1976).
+    Gram-Schmidt, and once more in strands that lost most of their length and with it digits (Daniel, Gragg, Kaufman
+    and Stewart 1976).
     """
     overlaps = strands.projections(basis, vector)
     whole = (overlaps * overlaps).sum(axis=0)
     _require_finite(whole, "the operator's product")
     vector -= strands.combination(basis, overlaps)
     last = strands.norms(vector)
-    again = last * last < whole
+    again = last < LOSS * np.sqrt(whole)
     if again.any():
         more = np.where(again, strands.projections(basis, vector), 0.0)
         vector -= strands.combination(basis, more)
@@ -193,6 +195,6 @@ def _scaled_to_one(strands: Strands, columns: Float32) -> tuple[Float64, Float32
 
 
 def _require_finite(values: Float32 | Float64, what: str) -> None:
-    """values (c,) or (c, g)"""
+    """values (c, ...)"""
     if not np.isfinite(values).all():
         raise ValueError(f"{what} is not finite in column {int(np.argwhere(~np.isfinite(values))[0][0])}")

@@ -95,11 +95,11 @@ class Strands:
         return length
 
     def largest(self, a: Float32) -> Float64:
-        """(c, g) the largest magnitude; NaN where there is one."""
-        by_block: Float64 = np.abs(a).max(axis=2).astype(np.float64)
-        if not len(self._first):
-            return by_block
-        return np.asarray(np.maximum.reduceat(by_block, self._first, axis=1))
+        """(c, g) the largest magnitude."""
+        magnitude = np.abs(a).reshape(len(a), -1)
+        if not magnitude.shape[1]:
+            return np.zeros((len(a), 0))
+        return np.maximum.reduceat(magnitude, self._first * BLOCK, axis=1).astype(np.float64)
 
     def scaled(self, vector: Float32, factor: Float64) -> Float32:
         """factor (c, g) · vector."""
