@@ -22,6 +22,8 @@ from .sheets import ALIGN_PX, Sheet, make_sheet, sheet_of_surfaces
 INPUT_SCALE = 0.3
 #: The filter may lose light (fireflies that it takes out whole); giving back more than this would only invent.
 MOST_GAIN = 2.0
+#: W/m² that count as none: what lies below cannot be brought to mean 1 in float32.
+DARK = 1e-30
 #: What the filter makes of grey is read off an image of this size: by a few per mille less or more than grey near the
 #: image's border, by 4 % in its corners (small network: 20 %), and that is taken back.
 FLAT_PX = 64
@@ -32,8 +34,9 @@ class _Kept:
     """A sheet and what the last calls made of it, by the key of the call."""
 
     sheet: Sheet
+    inverse_flat: Float32  # (m, 3) takes back what the filter makes of grey there
     stand_in: Int32 | None = None  # (m,) that ``sources`` are for
-    sources: Int32 | None = None  # (p,) see Sheet.sources
+    sources: Int32 | None = None  # (h * w,) see Sheet.sources
     results: dict[str, tuple[Float32, Int32, Float32]] = field(default_factory=dict)  # values, stand-ins, result
 
 
@@ -82,9 +85,9 @@ class MapDenoiser:
         result = np.zeros_like(known)
         for kept in self._kept.values():
             texels = kept.sheet.texels
-            nearest = stand_in[texels]
-            nearest = np.where(nearest < 0, np.int32(-1), self._local[nearest])
-            result[texels] = self._on_sheet(kept, known[texels], nearest, key)
+            nearest = stand_in.take(texels)
+            nearest = np.where(nearest < 0, np.int32(-1), self._local.take(nearest, mode="clip"))
+            result[texels] = self._on_sheet(kept, known.take(texels, axis=0), nearest, key)
         return result
 
     def _lay_out(self, component: Int32 | None) -> None:
@@ -101,13 +104,17 @@ class MapDenoiser:
         for texels in np.split(order, np.flatnonzero(np.diff(sheet[order])) + 1) if len(order) else []:
             surface = self._surface[texels]
             name = np.unique(surface).tobytes()
-            self._kept[name] = before.get(name) or _Kept(
+            self._kept[name] = before.get(name) or self._started(
                 make_sheet(texels, surface, self._cluster[texels], self._row[texels], self._col[texels])
             )
             self._local[texels] = np.arange(len(texels), dtype=np.int32)
         shapes = {kept.sheet.index.shape for kept in self._kept.values()}
         for shape in [shape for shape in self._filters if shape not in shapes]:
             self._filters.pop(shape).close()
+
+    def _started(self, sheet: Sheet) -> _Kept:
+        height, width = sheet.index.shape
+        return _Kept(sheet, 1 / self._flat[_flat_place(sheet.row, height), _flat_place(sheet.col, width)])
 
     def _on_sheet(self, kept: _Kept, values: Float32, stand_in: Int32, key: str) -> Float32:
         """(m, 3) of one sheet; ``values`` (m, 3), zero where not valid; ``stand_in`` (m,) on the sheet."""
@@ -117,27 +124,25 @@ class MapDenoiser:
                 return old_result
         if kept.sources is None or kept.stand_in is None or not np.array_equal(stand_in, kept.stand_in):
             kept.stand_in, kept.sources = stand_in, kept.sheet.sources(stand_in)
-        result = self._filtered(kept.sheet, values, kept.sources, stand_in == np.arange(len(stand_in)))
+        result = self._filtered(kept, values, kept.sources, stand_in == np.arange(len(stand_in)))
         self.filtered += len(values)
         kept.results[key] = values, stand_in, result
         return result
 
-    def _filtered(self, sheet: Sheet, values: Float32, sources: Int32, seen: Bool) -> Float32:
-        count = np.maximum(np.bincount(sheet.surface, weights=seen), 1)[:, None]
-        mean = _sums(sheet.surface, values) / count
+    def _filtered(self, kept: _Kept, values: Float32, sources: Int32, seen: Bool) -> Float32:
+        sheet = kept.sheet
+        count = np.maximum(sheet.sums @ seen, 1)[:, None]
+        mean = (sheet.sums @ values) / count
         relative = _relative_to(mean, values, sheet.surface)
+        shown = np.concatenate([relative, np.ones((1, 3), np.float32)])
         opened = self._filter_of(sheet.index.shape)
-        pixels, output = opened.color.reshape(-1, 3), opened.output.reshape(-1, 3)
-        pixels[:] = 1
-        pixels[sheet.shown] = np.concatenate([relative, np.ones((1, 3), np.float32)])[sources]
+        shown.take(sources, axis=0, out=opened.color.reshape(-1, 3), mode="clip")
         opened.run()
-        height, width = sheet.index.shape
-        flat = self._flat[_flat_place(sheet.row, height), _flat_place(sheet.col, width)]
-        filtered = output[sheet.shown[: len(values)]] / flat
+        filtered = opened.output.reshape(-1, 3).take(sheet.pixel, axis=0) * kept.inverse_flat
         # The mean of ``relative`` is 1.
-        after = _sums(sheet.surface, np.where(seen[:, None], filtered, np.float32(0))) / count
+        after = sheet.sums @ (filtered if seen.all() else filtered * seen[:, None]) / count
         gain = 1 / np.maximum(after, 1 / MOST_GAIN)
-        return np.asarray(filtered * (gain * mean).astype(np.float32)[sheet.surface], np.float32)
+        return np.asarray(filtered * (gain * mean).astype(np.float32).take(sheet.surface, axis=0), np.float32)
 
     def _filter_of(self, shape: tuple[int, ...]) -> ImageFilter:
         if shape not in self._filters:
@@ -156,10 +161,10 @@ def _flat_place(at: Int32, side: int) -> Int32:
 
 def _known(values: Float32, seen: Bool) -> Float32:
     """``values`` (n, 3) where they are ``seen`` (n,), else zero; raises ValueError where those cannot be light."""
-    known = np.where(seen[:, None], values, np.float32(0))
-    if not np.isfinite(known).all():
+    known = values.copy()
+    known[~seen] = 0
+    if len(known) and not (known.min() >= 0 and known.max() < np.inf):
         require_finite(values[seen])
-    if (known < 0).any():
         raise ValueError(f"{np.count_nonzero((known < 0).any(axis=1))} texels are negative")
     return known
 
@@ -168,21 +173,17 @@ def _same_bits(a: Float32, b: Float32) -> bool:
     return np.array_equal(a.view(np.uint32), b.view(np.uint32))
 
 
-def _sums(surface: Int32, values: Float32) -> Float64:
-    """(k, 3) sum of ``values`` (m, 3) over each surface."""
-    return np.stack([np.bincount(surface, weights=channel) for channel in values.T], axis=1)
-
-
 def _relative_to(mean: Float64, values: Float32, surface: Int32) -> Float32:
     """``values`` over their surface's ``mean`` (k, 3). A channel without light shows the others' average, or 1: a
     colour at the edge of what there is would get a tint from the filter.
     """
-    lit = mean > 0
-    inverse = np.divide(1, mean, out=np.zeros_like(mean), where=lit)
-    relative: Float32 = (values * inverse[surface]).astype(np.float32)
+    lit = mean > DARK
+    inverse = np.divide(1, mean, out=np.zeros_like(mean), where=lit).astype(np.float32)
+    relative: Float32 = values * inverse.take(surface, axis=0)
     if not lit.all():
-        dark = ~lit[surface]
-        channels = 3 - dark.sum(axis=1)
-        grey = np.where(channels > 0, relative.sum(axis=1) / np.maximum(channels, 1), 1).astype(np.float32)
-        relative = np.where(dark, grey[:, None], relative)
+        rows = np.flatnonzero(~lit.all(axis=1)[surface])
+        part, shown = relative[rows], lit[surface[rows]]
+        channels = shown.sum(axis=1)
+        grey = np.where(channels > 0, part.sum(axis=1) / np.maximum(channels, 1), 1).astype(np.float32)
+        relative[rows] = np.where(shown, part, grey[:, None])
     return relative

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import sparse
 
 from ..layout.skyline import orders, place
 from ..scene import Bool, Int32
@@ -37,34 +38,44 @@ MOST_STRETCH = 1.5
 
 @dataclass(frozen=True)
 class Sheet:
-    """m texels of k surfaces on an image of (h, w) pixels, p of which show something.
+    """m texels of k surfaces on an image of (h, w) pixels, b of which are mirrored borders.
 
-    Texels and surfaces are numbered from 0 within the sheet; ``texels`` and ``surfaces`` say which they are.
+    Texels and surfaces are numbered from 0 within the sheet; ``texels`` says which they are.
     """
 
-    surfaces: Int32  # (k,) ascending
     texels: Int32  # (m,) ascending
     surface: Int32  # (m,) of each texel
+    sums: sparse.csr_matrix  # (k, m) float64, adds up the texels of each surface
     row: Int32  # (m,)
     col: Int32  # (m,)
     index: Int32  # (h, w) texel of each pixel, -1 where there is none
-    shown: Int32  # (p,) flat pixel: those of texels, then their mirrored borders
-    centre: Int32  # (p,) texel that the pixel lies on, or is mirrored around
+    border: Int32  # (b,) flat pixel
+    centre: Int32  # (b,) texel that the border is mirrored around
+
+    @property
+    def pixel(self) -> Int32:
+        """(m,) flat pixel of each texel."""
+        return self.row * np.int32(self.index.shape[1]) + self.col
 
     def sources(self, stand_in: Int32) -> Int32:
-        """(p,) texel to show at each of the pixels; -1 for none. ``stand_in`` (m,), see ``texels.stand_ins``.
+        """(h * w,) texel to show at each pixel; m for none. ``stand_in`` (m,), see ``texels.stand_ins``.
 
         Pixels of texels that are not valid, and of borders, show the texel as far on the other side of the nearest
-        valid one, or that one itself where the island ends before.
+        valid one (within the image), or that one itself where the island ends before.
         """
+        own = np.arange(len(stand_in), dtype=np.int32)
+        lost = np.flatnonzero(stand_in != own)
+        pixel = np.concatenate([self.pixel[lost], self.border])
+        nearest = stand_in[np.concatenate([lost, self.centre])]
         height, width = self.index.shape
-        nearest = stand_in[self.centre]
-        row = np.clip(2 * self.row[nearest] - self.shown // width, 0, height - 1)
-        col = np.clip(2 * self.col[nearest] - self.shown % width, 0, width - 1)
+        row = np.clip(2 * self.row[nearest] - pixel // width, 0, height - 1)
+        col = np.clip(2 * self.col[nearest] - pixel % width, 0, width - 1)
         beyond = self.index[row, col]
-        same = (beyond >= 0) & (self.surface[beyond] == self.surface[nearest])
-        same &= stand_in[beyond] == beyond
-        return np.where(nearest < 0, np.int32(-1), np.where(same, beyond, nearest)).astype(np.int32)
+        same = (beyond >= 0) & (self.surface[beyond] == self.surface[nearest]) & (stand_in[beyond] == beyond)
+        none = np.int32(len(stand_in))
+        shown = np.where(self.index >= 0, self.index, none).ravel()
+        shown[pixel] = np.where(nearest < 0, none, np.where(same, beyond, nearest))
+        return shown
 
 
 def sheet_of_surfaces(counts: Int32, component: Int32) -> Int32:
@@ -82,7 +93,7 @@ def sheet_of_surfaces(counts: Int32, component: Int32) -> Int32:
     total = np.bincount(group, weights=counts).astype(np.int64)
     before = np.cumsum(counts[order]) - counts[order] - np.repeat(np.cumsum(total) - total, np.bincount(group))
     parts = np.maximum(np.round(total / SHEET_TEXELS), 1).astype(np.int64)[group[order]]
-    part = before * parts // np.maximum(total[group[order]], 1)
+    part = np.minimum(before * parts // np.maximum(total[group[order]], 1), parts - 1)
     sheet = np.zeros(len(group), np.int64)
     sheet[order] = group[order] * (int(part.max(initial=0)) + 1) + part
     return np.asarray(np.unique(sheet, return_inverse=True)[1], np.int32)
@@ -93,7 +104,7 @@ def make_sheet(texels: Int32, surface: Int32, cluster: Int32, row: Int32, col: I
 
     Islands of one ``cluster`` (m,) lie on one page; they keep their places to each other where that is tighter.
     """
-    surfaces, local = np.unique(surface, return_inverse=True)
+    local = np.unique(surface, return_inverse=True)[1]
     block = _blocks(local, np.unique(cluster, return_inverse=True)[1], row, col)
     low, size = _boxes(block, row, col)
     corner, width, height = _packed(size + GAP_PX)
@@ -102,17 +113,17 @@ def make_sheet(texels: Int32, surface: Int32, cluster: Int32, row: Int32, col: I
     index = np.full((height, width), -1, np.int32)
     index[row, col] = np.arange(len(texels), dtype=np.int32)
     near_row, near_col, distance = nearest_pixel(index)
-    border = np.flatnonzero((index < 0) & (distance <= MIRROR_PX))
-    own = row * np.int32(width) + col
+    border = np.flatnonzero((index < 0) & (distance <= MIRROR_PX)).astype(np.int32)
+    ones = np.ones(len(texels)), (local, np.arange(len(texels)))
     return Sheet(
-        surfaces=surfaces.astype(np.int32),
         texels=texels,
         surface=local.astype(np.int32),
+        sums=sparse.csr_matrix(ones),
         row=row,
         col=col,
         index=index,
-        shown=np.concatenate([own, border]).astype(np.int32),
-        centre=np.concatenate([index[row, col], index[near_row, near_col].ravel()[border]]),
+        border=border,
+        centre=index[near_row, near_col].ravel()[border],
     )
 
 
@@ -141,8 +152,9 @@ def _packed(sizes: Int32) -> tuple[Int32, int, int]:
 
     The rectangles' last GAP_PX may hang over.
     """
-    square = float(sizes.prod(axis=1).sum()) ** 0.5
-    least = max(_aligned(int(sizes[:, 0].max())), _aligned(round(square / MOST_STRETCH)))
+    area, (widest, tallest) = int(sizes.prod(axis=1).sum()), sizes.max(axis=0).tolist()
+    square = area**0.5
+    least = _aligned(max(widest, min(round(square / MOST_STRETCH), area // tallest)))
     widths = range(least, max(least, _aligned(round(square * MOST_STRETCH))) + 1, ALIGN_PX)
     tries = [(width, order) for width in sorted(widths, key=lambda w: abs(w - square)) for order in range(4)]
     sequences = orders(sizes, several=True)
