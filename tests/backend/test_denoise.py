@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtgi_addon.backend.finish.denoise import MOST_GAIN, MapDenoiser
-from rtgi_addon.backend.finish.oidn import Denoiser, FilterKind, OidnError, find_oidn
+from rtgi_addon.backend.finish.oidn import Denoiser, FilterKind, ImageFilter, OidnError, find_oidn
 
 
 def bpy_libraries() -> list[Path]:
@@ -454,3 +454,54 @@ def test_a_broken_call_leaves_the_memory_right(denoiser):
     with pytest.raises(ValueError, match="not finite"):
         maps.denoise(broken)
     np.testing.assert_array_equal(maps.denoise(values), before)
+
+
+@needs_oidn
+def test_maps_are_the_same_for_any_thread_count(denoiser):
+    index, surface = scattered(3)
+    values = noise(len(surface))
+    whole = MapDenoiser(denoiser, index, surface).denoise(values)
+    for threads in (1, 2, 3):
+        with Denoiser(LIBRARY, threads=threads) as opened:
+            maps = MapDenoiser(opened, index, surface)
+            np.testing.assert_array_equal(maps.denoise(values), whole)
+            # The filter is kept open: what it did before leaves no trace.
+            maps.denoise(values * values)
+            np.testing.assert_array_equal(maps.denoise(values), whole)
+
+
+@needs_oidn
+def test_hundreds_of_closets_are_few_images(denoiser, monkeypatch):
+    """225 closed boxes of 9 texels beside a hall: two images; what changes in a closet leaves the hall's bits."""
+    boxes = [(4 + 5 * (k // 15), 4 + 5 * (k % 15), 3, 3) for k in range(225)]
+    index, surface = layout((90, 4, 40, 40), *boxes, size=140)
+    maps = MapDenoiser(denoiser, index, surface)
+    runs = []
+    plain = ImageFilter.run
+
+    def spied(self):
+        runs.append(self.color.shape)
+        plain(self)
+
+    monkeypatch.setattr(ImageFilter, "run", spied)
+    values = noise(len(surface))
+    before = maps.denoise(values, component=np.arange(226, dtype=np.int32))
+    assert len(runs) == 2 and maps.filtered == 1600 + 225 * 9
+    values[surface == 100] *= 3
+    after = maps.denoise(values, component=np.arange(226, dtype=np.int32))
+    assert len(runs) == 3 and maps.filtered == 225 * 9
+    np.testing.assert_array_equal(after[surface == 0], before[surface == 0])
+
+
+@needs_oidn
+def test_filters_end_with_their_denoiser():
+    with Denoiser(LIBRARY) as opened:
+        kept = opened.filter_of(32, 48, input_scale=0.3)
+        kept.color[:] = 1
+        kept.run()
+        assert np.abs(kept.output[8:-8, 8:-8] - 1).max() < 0.01
+    with pytest.raises(ValueError, match="closed"):
+        kept.run()
+    kept.close()
+    with pytest.raises(ValueError, match="closed"):
+        opened.filter_of(32, 32)

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.sparse
+import scipy.sparse.csgraph
 
 from ..final_gather.solvers import conjugate_gradients
 from ..scene import Atlas, Bool, Float32, Float64, Int32, Mesh, Placement, Scene
@@ -109,6 +110,9 @@ class SeamMatcher:
         self._system = (system + KEEP * scipy.sparse.identity(self.texel_count)).tocsr().astype(np.float32)
         self._jump = self._jump.astype(np.float32)
         self._back = (MATCH * self._jump.T).tocsr().astype(np.float32)
+        #: Texels of different groups do not hang together: each is solved by itself, and only when it changed.
+        self._group = scipy.sparse.csgraph.connected_components(self._system, directed=False)[1].astype(np.int32)
+        self._kept: tuple[Float32, Float32] | None = None  # last values of the texels, and their changes
 
     def jumps(self, values: Float32) -> Float32:
         """(samples, c) difference that is seen across the seams; ``values`` (n, c)."""
@@ -120,11 +124,30 @@ class SeamMatcher:
         """``values`` (n, c) >= 0 with seams closed; constants stay, and so does the sum (but for clipping at 0)."""
         if not self.texel_count:
             return values
-        wanted = np.asarray(-(self._back @ self.jumps(values)), np.float32)
-        change = conjugate_gradients(lambda x: np.asarray(self._system @ x, np.float32), wanted, tolerance=TOLERANCE)
+        here = values[self._active]
+        change = self._changes(here)
+        self._kept = here, change
         matched = values.copy()
-        matched[self._active] = np.maximum(values[self._active] + change.x, 0)
+        matched[self._active] = np.maximum(here + change, 0)
         return matched
+
+    def _changes(self, here: Float32) -> Float32:
+        """(a, c) what is to be added to ``here`` (a, c), the values of the texels that may change.
+
+        Groups that are as they were last time keep their changes: the solver would find the same bits.
+        """
+        group, kept = self._group, np.zeros_like(here)
+        if self._kept is not None and self._kept[0].shape == here.shape:
+            before, kept = self._kept
+            differs = (here.view(np.uint32) != before.view(np.uint32)).any(axis=1)
+            group = np.where(np.bincount(group, weights=differs)[group] > 0, group, np.int32(-1))
+            if (group < 0).all():
+                return kept
+        wanted = np.asarray(-(self._back @ (self._jump @ here)), np.float32)
+        solution = conjugate_gradients(
+            lambda x: np.asarray(self._system @ x, np.float32), wanted, group=group, tolerance=TOLERANCE
+        )
+        return np.where((group < 0)[:, None], kept, solution.x)
 
 
 def _samples(scene: Scene, atlas: Atlas, dilation: DilationMap, surface: Int32) -> tuple[Int32, Float64]:
