@@ -19,7 +19,7 @@ Rows = NDArray[np.int64]
 #: Photons of a group, about: Larsen04 has 77 groups of 40.
 GROUP_SIZE = 40
 #: Cells are at most so many times longer than wide, in the unit square.
-_LONGEST = 3.0
+_LONGEST = 4.0
 
 
 @dataclass(frozen=True)

@@ -69,10 +69,13 @@ class PathPool:
     def starts(self, paths: Rows) -> tuple[Float32, Float32, Float32]:
         """Origin, direction and guide (k, 3) that ``paths`` (k,) were traced from."""
         landed = self._length[paths] > 0
-        direction, guide = self._of_path["end_direction"][paths], self._of_path["end_flux"][paths]
         first = self._first[paths[landed]]
-        direction[landed], guide[landed] = self._of_hit["direction"][first], self._of_hit["flux"][first]
-        return self._of_path["origin"][paths], direction, guide
+        out = []
+        for at_end, at_hit in (("end_direction", "direction"), ("end_flux", "flux")):
+            column = self._of_path[at_end].take(paths, axis=0)
+            column[landed] = self._of_hit[at_hit].take(first, axis=0)
+            out.append(column)
+        return self._of_path["origin"].take(paths, axis=0), out[0], out[1]
 
     def select(self, hits: Bool | None = None) -> PhotonPaths:
         """All paths, with flux in W, and of their hits those chosen by ``hits`` (used,)."""
@@ -87,7 +90,7 @@ class PathPool:
         return PhotonPaths(
             first_hit=first,
             **{name: column.copy() for name, column in self._of_path.items()},
-            **{name: column[rows] for name, column in self._of_hit.items()},
+            **{name: column.take(rows, axis=0) for name, column in self._of_hit.items()},
         )
 
     # --- changes --------------------------------------------------------------------------------------------------
@@ -117,13 +120,13 @@ class PathPool:
         same: Bool = equal_bits(factor, self.factor[rows])
         common = np.where(same, np.minimum(length, fresh_length), 0)
         for name in PATH_FIELDS:
-            same &= equal_bits(self._of_path[name][rows], getattr(fresh, name))
+            same &= equal_bits(self._of_path[name].take(rows, axis=0), getattr(fresh, name))
         path = np.repeat(np.arange(len(rows)), common)
         bounce = np.arange(len(path)) - np.repeat(np.cumsum(common) - common, common)
         mine, its = self._first[rows][path] + bounce, fresh.first_hit[path] + bounce
         equal = np.ones(len(path), np.bool_)
         for name in HIT_FIELDS:
-            equal &= equal_bits(self._of_hit[name][mine], getattr(fresh, name)[its])
+            equal &= equal_bits(self._of_hit[name].take(mine, axis=0), getattr(fresh, name).take(its, axis=0))
         same &= length == fresh_length
         same[path[~equal]] = False
         stays, fresh_stays = np.zeros(int(length.sum()), np.bool_), np.zeros(len(fresh.triangle), np.bool_)
@@ -183,7 +186,10 @@ def _longer(column: NDArray[Any], size: int) -> NDArray[Any]:
 
 
 def equal_bits(a: NDArray[Any], b: NDArray[Any]) -> Bool:
-    """(k,) rows of the same bits."""
+    """(k,) rows of (k,) or (k, 3) arrays that are the same to the last bit."""
     if a.dtype == np.float32:
         a, b = np.ascontiguousarray(a).view(np.int32), np.ascontiguousarray(b).view(np.int32)
-    return np.asarray(a == b if a.ndim == 1 else (a == b).all(axis=1))
+    if a.ndim == 1:
+        return np.asarray(a == b)
+    # Column by column: NumPy is slow to reduce an axis of three.
+    return np.asarray((a[:, 0] == b[:, 0]) & (a[:, 1] == b[:, 1]) & (a[:, 2] == b[:, 2]))

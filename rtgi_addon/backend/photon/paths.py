@@ -136,8 +136,8 @@ def take_paths(paths: PhotonPaths, keep: NDArray[np.integer[Any]]) -> PhotonPath
     hits = paths.hits_of(keep)
     return PhotonPaths(
         first_hit=first,
-        **{name: getattr(paths, name)[keep] for name in PATH_FIELDS},
-        **{name: getattr(paths, name)[hits] for name in HIT_FIELDS},
+        **{name: getattr(paths, name).take(keep, axis=0) for name in PATH_FIELDS},
+        **{name: getattr(paths, name).take(hits, axis=0) for name in HIT_FIELDS},
     )
 
 

@@ -290,22 +290,23 @@ class _Deltas:
     """Δ_f, Δ_i and the AIM's Δ being summed up (see PhotonUpdate)."""
 
     def __init__(self, texels: Texels) -> None:
-        self._surface, self._count = texels.surface, texels.surface_count
-        self.sums: tuple[Float64, Float64, Float64] = (self._none(), self._none(), self._none())
+        self._surface = texels.surface
+        self._of_kind = np.zeros((texels.surface_count, 3))  # lamps' direct light, other direct light, bounced
+
+    @property
+    def sums(self) -> tuple[Float64, Float64, Float64]:
+        direct, other, bounced = self._of_kind.T
+        return direct + other + bounced, bounced.copy(), other + bounced
 
     def add(self, pool: PathPool, hits: Rows, factor: Float32 | None = None) -> None:
         """The flux of ``hits`` (k,) of the pool; by ``factor`` (p, 3) instead of the paths' own."""
         texel = pool.hit("texel")[hits]
         hits, texel = hits[texel >= 0], texel[texel >= 0]
         path = pool.path[hits]
-        flux = pool.hit("flux")[hits] * (pool.factor if factor is None else factor)[path]
-        amount = flux.max(axis=1, initial=0).astype(np.float64)
-        surface = self._surface[texel]
-        bounced = (pool.hit("flags")[hits] & AFTER_DIFFUSE) > 0
+        flux = pool.hit("flux").take(hits, axis=0) * (pool.factor if factor is None else factor).take(path, axis=0)
+        amount = np.maximum(np.maximum(flux[:, 0], flux[:, 1]), flux[:, 2])
         light = pool.of_path("light")[path]
-        unlit = bounced | (light == MESHES) | (light == SKY)
-        for total, chosen in zip(self.sums, (slice(None), bounced, unlit), strict=True):
-            total += np.bincount(surface[chosen], amount[chosen], minlength=self._count)
-
-    def _none(self) -> Float64:
-        return np.zeros(self._count)
+        kind = ((light == MESHES) | (light == SKY)).astype(np.int64)
+        kind[(pool.hit("flags")[hits] & AFTER_DIFFUSE) > 0] = 2
+        place = self._surface[texel] * np.int64(3) + kind
+        self._of_kind += np.bincount(place, amount, minlength=self._of_kind.size).reshape(-1, 3)
