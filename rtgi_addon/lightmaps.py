@@ -55,7 +55,8 @@ def apply_lightmaps(
     with frame_kept(scene):
         found = Survey()
         for frame in maps.frames:
-            if len(found.known) < len(source.instances):
+            new_lamps = any(shown[0] == frame for shown in source.lamp_frames)
+            if new_lamps or len(found.known) < len(source.instances):
                 scene.frame_set(frame)
                 read_as_rendered(scene, bpy.context.view_layer, lambda depsgraph: survey(depsgraph, source, found))
         chosen = sorted(found.known - set(found.own))
@@ -127,11 +128,10 @@ def _motions(
         return {}, {}
     read = [states[i] for i in range(len(states))]  # once: each is a visit to the scene
     lamps = {}
-    for name in found.lamps:
-        matrices = [{light.name: light.matrix_world for light in state.lights}.get(name) for state in read]
-        known = next(m for m in matrices if m is not None)
-        shown = np.array([m is not None for m in matrices])
-        lamps[name] = Motion(np.array([known if m is None else m for m in matrices]), shown)
+    for number, light in enumerate(source.lights):
+        if light.name in found.lamps:
+            matrices = np.array([state.lights[number].matrix_world for state in read])
+            lamps[light.name] = Motion(matrices, np.isin([s.frame for s in read], source.lamp_frames[number]))
     return motions(source, read, chosen), lamps
 
 

@@ -35,13 +35,15 @@ class SourceScene:
     meshes: tuple[SourceMesh, ...]
     instances: tuple[Instance, ...]
     material_names: tuple[str | None, ...]  # None: Blender's default grey for a face without a material
-    lights: tuple[Light, ...]
+    lights: tuple[Light, ...]  # of all frames, by first appearance, as in the first; dark where not there yet
     world: World | None
     warnings: tuple[str, ...] = ()
     keys: tuple[tuple[str | int, ...], ...] = ()  # by instance: what finds its object again in another frame
     looks: tuple[bytes | None, ...] = ()  # by instance: which variant of its object it is; None: the only one
     first_frames: tuple[int, ...] = ()  # by instance: where it is first seen
     lit: bool = True  # a lamp or the sky gives light in some frame
+    lamp_keys: tuple[tuple[str | int, ...], ...] = ()  # what finds each lamp again in another frame
+    lamp_frames: tuple[tuple[int, ...], ...] = ()  # by lamp: those of the frames in which it is there
 
 
 @dataclass(frozen=True)

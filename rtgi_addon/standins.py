@@ -103,7 +103,7 @@ def survey(depsgraph: bpy.types.Depsgraph, source: SourceScene, found: Survey) -
         found.hidden[str(placed.key[0] or placed.key[1])] = None
         if mesh not in found.copies:
             found.copies[mesh] = copy_mesh(placed.data, placed.materials)
-    _survey_others(depsgraph, found)
+    _survey_others(depsgraph, source, found)
     return found
 
 
@@ -114,21 +114,19 @@ def _keeps_itself(obj: bpy.types.Object, evaluated: bpy.types.Mesh, *, has_layou
     return has_room and topology_digest(obj.data) == topology_digest(evaluated)
 
 
-def _survey_others(depsgraph: bpy.types.Depsgraph, found: Survey) -> None:
+def _survey_others(depsgraph: bpy.types.Depsgraph, source: SourceScene, found: Survey) -> None:
     """Lamps and the rest that hiding the instancers would take away."""
-    count: dict[str, int] = {}
+    lamps = {key: light.name for key, light in zip(source.lamp_keys, source.lights, strict=True)}
     for instance in depsgraph.object_instances:
         obj = instance.object
         if not instance.show_self or isinstance(obj.data, bpy.types.Mesh) or obj.type == "EMPTY":
             continue
         name, key = identify(instance)
-        count[name] = count.get(name, 0) + 1
         if key[0] not in found.hidden:
             continue
-        if obj.type == "LIGHT":
-            name = name if count[name] == 1 else f"{name}#{count[name]}"  # as lamps are named in FrameState
-            found.lamps[name] = obj.data.original.name_full
-        else:
+        if key in lamps:
+            found.lamps[lamps[key]] = obj.data.original.name_full
+        elif obj.type != "LIGHT":  # a portal shows nothing
             found.lost[f"{name}: {obj.type.lower()} objects in instances are not shown in the preview"] = None
 
 

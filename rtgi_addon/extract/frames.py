@@ -22,6 +22,8 @@ from .meshes import loop_normals, positions
 from .placed import Placed, placed_meshes
 from .variants import Finder
 
+_NEW = "appears in frame {}, which the bake was not told of; bake it again"
+
 
 @dataclass
 class Reading:
@@ -75,14 +77,17 @@ def _read(depsgraph: bpy.types.Depsgraph, source: SourceScene, frame: int) -> Re
         instance = source.instances[index]
         if instance.deforming and instance.mesh not in reading.vertices:
             _read_deformed(placed, source, instance.mesh, frame, reading)
-    reading.lamps = lights.lights_of(depsgraph, _told_already)
+    found = lights.lights_of(depsgraph, _told_already)
+    if new := [lamp.name for key, lamp in found.items() if key not in source.lamp_keys]:
+        raise BakeError(f"{new[0]}: {_NEW.format(frame)}")
+    reading.lamps = lights.in_order(found, source.lamp_keys, source.lights)
     reading.lobes = materials.animated_lobes(source, depsgraph)
     return reading
 
 
 def _unknown(placed: Placed, frame: int, *, seen: bool) -> str:
     if not seen:
-        return f"{placed.name}: appears in frame {frame}, which the bake was not told of; bake it again"
+        return f"{placed.name}: {_NEW.format(frame)}"
     return (
         f"{placed.name}: has other faces or materials in frame {frame} than when that frame was first looked at; bake "
         "its simulation to disk first, so that a frame is always the same"

@@ -8,14 +8,15 @@ tests/blender/test_light_units.py. Settings that only Eevee knows are told, not 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 
 import bpy
 import numpy as np
 
-from ..backend.scene import AreaShape, Float64, Light, LightKind
+from ..backend.scene import BLACK, AreaShape, Float64, Light, LightKind
 from . import nodes
-from .placed import placed_lights
+from .placed import Key, placed_lights
 
 Warn = Callable[[str], None]
 RGB = tuple[float, float, float]
@@ -25,10 +26,23 @@ KINDS = {"POINT": LightKind.POINT, "SPOT": LightKind.SPOT, "SUN": LightKind.SUN,
 MIN_SPREAD = math.radians(1)
 
 
-def lights_of(depsgraph: bpy.types.Depsgraph, warn: Warn) -> tuple[Light, ...]:
+def lights_of(depsgraph: bpy.types.Depsgraph, warn: Warn) -> dict[Key, Light]:
     """Every lamp that a render would use, in the depsgraph's order; those that send nothing out too."""
+    return {
+        key: light_of(obj, name, matrix, warn)
+        for key, name, obj, matrix in placed_lights(depsgraph)
+        if not _is_portal(obj.data)
+    }
+
+
+def in_order(found: Mapping[Key, Light], keys: Sequence[Key], known: Sequence[Light]) -> tuple[Light, ...]:
+    """The lamps of one frame as all frames have them: under the names and in the places of ``known``, by ``keys``.
+
+    A lamp's place seeds its samples, so it never changes; one that is not ``found`` stands there as known, but dark.
+    """
     return tuple(
-        light_of(obj, name, matrix, warn) for name, obj, matrix in placed_lights(depsgraph) if not _is_portal(obj.data)
+        replace(found[key], name=light.name) if key in found else replace(light, power=BLACK)
+        for key, light in zip(keys, known, strict=True)
     )
 
 

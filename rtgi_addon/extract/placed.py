@@ -59,15 +59,12 @@ def placed_meshes(depsgraph: bpy.types.Depsgraph, warn: Callable[[str], None]) -
         yield Placed((*key, part), name, matrix, obj, obj.data, slot_materials(obj), blocks, receives)
 
 
-def placed_lights(depsgraph: bpy.types.Depsgraph) -> Iterator[tuple[str, bpy.types.Object, Float64]]:
-    """(name, evaluated object, matrix) of each lamp that a render would use."""
-    count: dict[str, int] = {}
+def placed_lights(depsgraph: bpy.types.Depsgraph) -> Iterator[tuple[Key, str, bpy.types.Object, Float64]]:
+    """(key, name, evaluated object, matrix) of each lamp that a render would use; instances may share a name."""
     for instance in depsgraph.object_instances:
         if instance.object.type == "LIGHT" and instance.show_self:
-            name, _ = identify(instance)
-            count[name] = count.get(name, 0) + 1
-            matrix = np.array(instance.matrix_world, np.float64)
-            yield name if count[name] == 1 else f"{name}#{count[name]}", instance.object, matrix
+            name, key = identify(instance)
+            yield key, name, instance.object, np.array(instance.matrix_world, np.float64)
 
 
 def identify(instance: bpy.types.DepsgraphObjectInstance) -> tuple[str, Key]:

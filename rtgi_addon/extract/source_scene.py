@@ -46,7 +46,8 @@ class Census:
     faces: dict[tuple[int, MeshUse], Faces] = field(default_factory=dict)
     shape: dict[tuple[int, MeshUse], bytes] = field(default_factory=dict)  # differs where vertices or normals do
     bad: dict[tuple[int, MeshUse], Bool] = field(default_factory=dict)  # non-finite vertices
-    lamps: dict[int, tuple[Light, ...]] = field(default_factory=dict)  # by frame
+    lamps: dict[Key, Light] = field(default_factory=dict)  # as first met
+    lamp_frames: dict[Key, list[int]] = field(default_factory=dict)
     lit: bool = False  # by a lamp or the sky, in any frame
     extra_triangles: int = 0  # of all looks of objects but their first
 
@@ -100,8 +101,10 @@ def _visit(depsgraph: bpy.types.Depsgraph, frame: int, census: Census) -> None:
         else:
             known.moving |= not np.array_equal(known.first.matrix, placed.matrix)
         known.uses[frame] = use
-    census.lamps[frame] = lights.lights_of(depsgraph, census.warn)
-    census.lit |= any(max(lamp.power) > 0 for lamp in census.lamps[frame])
+    for key, lamp in lights.lights_of(depsgraph, census.warn).items():
+        census.lamps.setdefault(key, lamp)
+        census.lamp_frames.setdefault(key, []).append(frame)
+        census.lit |= max(lamp.power) > 0
 
 
 def _examine(placed: Placed, at: tuple[int, MeshUse], census: Census) -> None:
@@ -152,14 +155,24 @@ def _assemble(census: Census, frames: Sequence[int], sky: World | None) -> Sourc
         meshes=tuple(meshes),
         instances=tuple(instances),
         material_names=tuple(material_index),
-        lights=census.lamps[frames[0]],
+        lights=_first_lights(census, frames[0]),
         world=sky,
         warnings=tuple(census.warnings),
         keys=tuple(key for key, looks in census.seen.items() for _ in looks),
         looks=tuple(look if len(looks) > 1 else None for looks in census.seen.values() for look in looks),
         first_frames=tuple(next(iter(seen.uses)) for seen in _all_seen(census)),
         lit=census.lit,
+        lamp_keys=tuple(census.lamps),
+        lamp_frames=tuple(tuple(shown) for shown in census.lamp_frames.values()),
     )
+
+
+def _first_lights(census: Census, frame: int) -> tuple[Light, ...]:
+    """The lamps of all frames as they are in the first ``frame``, under unique names."""
+    names = unique_names([lamp.name for lamp in census.lamps.values()])
+    known = [replace(lamp, name=name) for lamp, name in zip(census.lamps.values(), names, strict=True)]
+    there = {key: lamp for key, lamp in census.lamps.items() if frame in census.lamp_frames[key]}
+    return lights.in_order(there, tuple(census.lamps), known)
 
 
 def _all_seen(census: Census) -> list[Seen]:
