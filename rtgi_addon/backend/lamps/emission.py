@@ -166,11 +166,15 @@ def make_bounds(geometry: Geometry) -> Bounds:
     """The box of all triangles, widened by a little so that it encloses flat scenes."""
     if geometry.triangle_count == 0:
         return Bounds(np.zeros(3), np.zeros(3))
-    corners = geometry.corners.reshape(-1, 3)
-    good = corners[np.isfinite(corners).all(axis=1)]
-    if not len(good):
-        return Bounds(np.zeros(3), np.zeros(3))
-    low, high = good.min(axis=0).astype(np.float64), good.max(axis=0).astype(np.float64)
+    rows = geometry.corners.reshape(-1, 9)  # long rows: NumPy takes the least of them many times faster
+    low, high = (extreme(rows, axis=0).reshape(3, 3) for extreme in (np.min, np.max))
+    low, high = low.min(axis=0).astype(np.float64), high.max(axis=0).astype(np.float64)
+    if not np.isfinite([low, high]).all():
+        corners = geometry.corners.reshape(-1, 3)
+        good = corners[np.isfinite(corners).all(axis=1)]
+        if not len(good):
+            return Bounds(np.zeros(3), np.zeros(3))
+        low, high = good.min(axis=0).astype(np.float64), good.max(axis=0).astype(np.float64)
     margin = 1e-4 * float(np.sqrt(((high - low) ** 2).sum()))
     return Bounds(low - margin, high + margin)
 

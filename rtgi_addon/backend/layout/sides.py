@@ -193,11 +193,11 @@ def _sides_hit_by_lamps(setting: _Setting) -> NDArray[np.intp]:
 def _first_rays(setting: _Setting) -> _Rays:
     """Rays from both sides of every instance that may have a map, evenly over its area and the hemisphere."""
     scene, geometry = setting.scene, setting.geometry
-    area = _areas(geometry)
+    receives = np.array([i.receives_light for i in scene.instances], np.bool_) & setting.state.visible
+    area = _areas(geometry, receives[geometry.instance_of_triangle])
     total = np.concatenate([[0.0], np.cumsum(area)])
     low, high = total[geometry.first_triangle[:-1]], total[geometry.first_triangle[1:]]
-    receives = np.array([i.receives_light for i in scene.instances], np.bool_)
-    tested = np.nonzero(receives & setting.state.visible & (high > low))[0]
+    tested = np.nonzero(high > low)[0]
     count = _rays_of_side(2 * len(tested))
     pick, weight = _numbers(tested, count, 0)
     # A triangle of the instance by area: the one in whose stretch of the running sum the number falls.
@@ -222,12 +222,15 @@ def _first_rays(setting: _Setting) -> _Rays:
     return _Rays(*(np.concatenate([getattr(s, name) for s in sides]) for name in names))
 
 
-def _areas(geometry: Geometry) -> Float64:
-    """(t,) m²; 0 for triangles without a normal, which no ray can leave or hit."""
-    corners = geometry.corners.astype(np.float64)
+def _areas(geometry: Geometry, wanted: Bool) -> Float64:
+    """(t,) m²; 0 for triangles not ``wanted`` (t,) and those without a normal, which no ray can leave or hit."""
+    rows = np.nonzero(wanted & geometry.normals.any(axis=1))[0]
+    corners = geometry.corners[rows].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    area = np.sqrt(np.einsum("ti,ti->t", cross, cross)) / 2
-    return np.where(geometry.normals.any(axis=1) & np.isfinite(area), area, 0.0)
+    of_rows = np.sqrt(np.einsum("ti,ti->t", cross, cross)) / 2
+    area = np.zeros(len(wanted))
+    area[rows] = np.where(np.isfinite(of_rows), of_rows, 0.0)
+    return area
 
 
 def _rays_of_side(sides: int) -> int:
