@@ -14,7 +14,7 @@ from rtgi_addon.backend.session import Session
 from rtgi_addon.backend.settings import BakeSettings, SampleCounts
 from rtgi_addon.backend.surface.texels import Texels, place_texels
 
-from .frames import Converged, converge, values
+from .frames import Converged, converge, open_session, values
 from .sequences import FrameSequence
 
 #: Frames (from 0) between which changes are measured.
@@ -45,7 +45,7 @@ def flicker(
 ) -> Flicker:
     """Of the bake with ``settings``, played from the sequence's first frame."""
     frames = sorted(converged.mean)
-    with Session(sequence.scene, sequence.atlas, settings, sequence.states[0], oidn_paths=oidn) as session:
+    with open_session(sequence, settings, oidn) as session:
         maps = {}
         for n, state in enumerate(sequence.states[: frames[-1] + 1]):
             result = session.advance(state)

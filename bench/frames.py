@@ -82,10 +82,7 @@ def play(
     compared = set() if converged is None else set(converged.mean)
     start = time.perf_counter()
     first = sequence.states[0]
-    with (
-        Session(sequence.scene, sequence.atlas, settings, first, oidn_paths=oidn) as selecting,
-        Session(sequence.scene, sequence.atlas, off, first, oidn_paths=oidn) as fresh,
-    ):
+    with open_session(sequence, settings, oidn) as selecting, open_session(sequence, off, oidn) as fresh:
         results, seconds = [], []
         scratch_results, scratch_seconds = {}, []
         selecting.advance(first)
@@ -115,6 +112,13 @@ def play(
     )  # fmt: skip
 
 
+def open_session(sequence: FrameSequence, settings: BakeSettings, oidn: Sequence[Path] = ()) -> Session:
+    """A session for the whole ``sequence``."""
+    return Session(
+        sequence.scene, sequence.atlas, settings, sequence.states[0], guide=sequence.guide, oidn_paths=oidn
+    )  # fmt: skip
+
+
 def converge(
     sequence: FrameSequence, frames: Iterable[int], *, counts: SampleCounts = CONVERGED, seeds: Sequence[int] = SEEDS
 ) -> Converged:
@@ -124,7 +128,7 @@ def converge(
     valid: dict[int, Bool] = {}
     for seed in seeds:
         settings = settings_of(counts, seed=seed, denoise=False, selection=Selection.OFF)
-        with Session(sequence.scene, sequence.atlas, settings, sequence.states[0]) as session:
+        with open_session(sequence, settings) as session:
             t = session.texels
             for n in frames:
                 maps = session.advance(sequence.states[n]).maps

@@ -110,7 +110,8 @@ def _gather_times(rig: Rig, rays: int) -> tuple[float, float]:
     """Milliseconds a texel: by itself, in a batch."""
     albedo = diffuse_shares(rig.surfaces, rig.texels.triangle)
     sent = sent_by_targets(rig.direct(1), albedo, np.zeros((rig.texels.count, 3), np.float32))
-    odds = bright_targets([bright_weight(sent, rig.frame.area, None, rig.geometry.extent)])
+    one_room = np.zeros(rig.texels.count, np.int32)
+    odds = bright_targets([bright_weight(sent, rig.frame.area, None, rig.geometry.extent)], one_room)
     tracer = GatherRays(
         rig.texels, rig.frame, rig.geometry, rig.surfaces, rig.tracer, None, odds, SampleCounts(rays // 2, rays // 2),
         max_specular=0, seed=0,

@@ -8,8 +8,10 @@ from pathlib import Path
 
 from .animation import QUALITIES, FramesResult, LarsenResult, ScalingResult
 from .document import PLOTS, machine_lines, write_part
+from .flicker import COUNTS as FLICKER_COUNTS
 from .flicker import FAR, Flicker
 from .flicker import FRAMES as FLICKER_FRAMES
+from .flicker import SEEDS as FLICKER_SEEDS
 from .frames import CONVERGED, SCRATCH_EVERY, SEEDS, Played
 from .larsen_tables import BATCH, NEAREST
 from .report_plots import plot_frames, plot_scaling, short
@@ -38,6 +40,7 @@ def write_frames(result: FramesResult, docs: Path) -> None:
 
 
 def _frames_head(result: FramesResult) -> str:
+    noise = max(e.reference_noise for p in result.played if p.errors for e in p.errors)
     return f"""## Animation: only what changed
 
 Sequences of 24 frames in which one thing changes (`bench/sequences.py`), baked with selection and from scratch
@@ -45,14 +48,15 @@ Sequences of 24 frames in which one thing changes (`bench/sequences.py`), baked 
 
 {machine_lines(result.machine)}
 - **Load average** of the machine before the run: {result.machine.load}.
-- **ms:** wall clock of `Session.advance`, from the frame's state to finished maps, median over the frames after the
-  first; from scratch over one frame in {SCRATCH_EVERY}. Slowest: the slowest frame with selection. Ratio: of the
-  medians.
-- **Rays:** all rays of a frame with selection, and from scratch; means. Links kept: share of gather rays that selection
-  did not trace again; texels: share of texels that were updated.
-- **Error:** as above, but from bakes of our own: the mean of {len(SEEDS)} bakes of {CONVERGED.total} rays with other
-  seeds, not denoised, every frame from scratch, at two frames. It shows noise and what the denoiser does to it; what
-  the method itself leaves out, only the comparison with Cycles shows.
+- **ms:** wall clock of `Session.advance`, from the frame's state to finished maps. Median over the frames after the
+  first; from scratch over one frame in {SCRATCH_EVERY}. Slowest: the slowest frame with selection; for what happens
+  once, the frame in which it does. Ratio: of the medians.
+- **Rays, links, photons:** means over the same frames. Tested: kept gather rays that were looked at one by one since
+  an object moved near them. Kept: the share that was not traced again.
+- **Error:** as for one frame above, but from bakes of our own: the mean of {len(SEEDS)} bakes of {CONVERGED.total} rays
+  with other seeds, not denoised, every frame from scratch, at two frames; their own noise, at most {noise:.1%}, is
+  taken out in quadrature. It shows noise and what the denoiser does to it; what the method itself leaves out, only the
+  comparison with Cycles shows.
 - **Difference:** the largest between a selected map and the same frame's from scratch, over texels and frames, relative
   to the texel (or to 1 % of the mean, where that is more).
 """
@@ -69,8 +73,8 @@ def _quality(name: str, played: Sequence[Played]) -> str:
 | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {rows}
 
-| sequence | rays | rays from scratch | links kept | photons kept | texels updated | surfaces updated |
-| --- | --- | --- | --- | --- | --- | --- |
+| sequence | rays | from scratch | links traced | tested | kept | photons traced | kept | texels updated | surfaces |
+| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |
 {counts}
 """
 
@@ -86,7 +90,8 @@ def _row(p: Played) -> str:
 def _counts_row(p: Played) -> str:
     c, s = p.selected.counts, p.scratch.counts
     return (
-        f"| {p.title} | {c['rays']:.0f} | {s['rays']:.0f} | {_share(c, 'links_kept', 'links_traced')} "
+        f"| {p.title} | {short(c['rays'])} | {short(s['rays'])} | {short(c['links_traced'])} "
+        f"| {short(c['links_tested'])} | {_share(c, 'links_kept', 'links_traced')} | {short(c['photons_traced'])} "
         f"| {_share(c, 'photons_kept', 'photons_traced')} | {_share(c, 'texels_updated', 'texels_kept')} "
         f"| {c['surfaces_updated']:.1f} of {c['surfaces_updated'] + c['surfaces_kept']:.0f} |"
     )
@@ -105,11 +110,12 @@ def _flickers(flickers: Sequence[Flicker]) -> str:
     rows = "\n".join(
         f"| {f.label} | {f.texels} | {f.percentile_95:.3%} | {f.largest:.3%} | {f.true_change:.3%} |" for f in flickers
     )
+    rays = FLICKER_COUNTS.total * len(FLICKER_SEEDS)
     return f"""### Flicker
 
-The block slides 2 mm a frame. Texels farther than {FAR} m from it, frames {FLICKER_FRAMES[0] + 1} to
-{FLICKER_FRAMES[-1] + 1}: the change from frame to frame, less the true change, as a share of the texel. The true change
-is that of converged bakes with the same rays in every frame.
+The block slides 2 mm a frame. At texels farther than {FAR} m from it, frames {FLICKER_FRAMES[0] + 1} to
+{FLICKER_FRAMES[-1] + 1}: the change from frame to frame, less the true change, as a share of the texel (or of 1 % of
+the mean, where that is more). The true change is that of bakes with {rays} rays a texel, the same in every frame.
 
 | quality | texels | 95th percentile | largest | true change, 95th percentile |
 | --- | --- | --- | --- | --- |
@@ -121,7 +127,8 @@ def _verdicts(result: FramesResult) -> str:
     """One line for each bar, at the default quality."""
     default = {p.sequence: p for p in result.played if p.label == QUALITIES[0].value}
     flicker = next(f for f in result.flickers if f.label == QUALITIES[0].value)
-    mover, lamp, still, larsen = (default[k] for k in ("mover", "lamp", "still", "larsen"))
+    mover, lamp, still, larsen, closed = (default[k] for k in ("mover", "lamp", "still", "larsen", "closed"))
+    other_room = _updated_beyond_half(closed)
     worst = max(default.values(), key=lambda p: p.difference)
     traced = lamp.selected.counts["links_traced"]
     assert mover.errors is not None
@@ -136,6 +143,7 @@ def _verdicts(result: FramesResult) -> str:
         (f"nothing changed: less than {STILL_MS:.0f} ms and no ray",
          still.selected.seconds < STILL_MS / 1000 and still.selected.counts["rays"] == 0,
          f"{_ms(still.selected.seconds)} ms, {still.selected.counts['rays']:.0f} rays"),
+        ("two closed rooms: no surface of the other room updated", other_room == 0, f"{other_room:.1f} surfaces"),
         (f"Larsen04's size, every texel in every frame: at most {LARSEN_MS:.0f} ms",
          larsen.selected.seconds <= LARSEN_MS / 1000, f"{_ms(larsen.selected.seconds)} ms"),
         (f"flicker far from a slow mover: at most {FLICKER:.0%}", flicker.percentile_95 <= FLICKER,
@@ -152,6 +160,12 @@ Quality {QUALITIES[0].value}.
 | --- | --- | --- |
 {lines}
 """
+
+
+def _updated_beyond_half(closed: Played) -> float:
+    """Surfaces updated in a frame beyond the half of them that is the mover's room: both rooms have as many."""
+    c = closed.selected.counts
+    return max(0.0, c["surfaces_updated"] - (c["surfaces_updated"] + c["surfaces_kept"]) / 2)
 
 
 def write_scaling(result: ScalingResult, docs: Path) -> None:

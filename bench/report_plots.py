@@ -47,8 +47,8 @@ def plot_frames(played: Sequence[Played], path: Path) -> None:
         total = 1000 * np.array([c.seconds for c in costs])
         axes.barh(places + offset, np.maximum(total - left, 0), 0.34, left=left, color=REST,
                   label="rest" if offset > 0 else None)  # fmt: skip
-        for y, ms in zip(places + offset, np.maximum(total, left), strict=True):
-            axes.annotate(f"{ms:.3g}", (ms, y), (4, 0), textcoords="offset points", va="center", fontsize=7.5)
+        for y, ms, end in zip(places + offset, total, np.maximum(total, left), strict=True):
+            axes.annotate(f"{ms:.3g}", (end, y), (4, 0), textcoords="offset points", va="center", fontsize=7.5)
     axes.set_yticks(places, [p.title for p in played], fontsize=8.5)
     axes.set_xlabel("ms a frame; upper bar: selected, lower bar: from scratch")
     axes.margins(x=0.06)

@@ -19,6 +19,8 @@ from tests.backend.scenes import cornell, grid_atlas, mesh_of_triangles, point_l
 from .rooms import door_at, larsen_box, turned, two_rooms
 
 FRAMES = 24
+#: Guide frames of a sequence at most.
+GUIDES = 5
 #: Texels along a wall of the Cornell box: 12k texels in all.
 CORNELL = 44
 #: Larsen04 §8: photon groups, and photons in each.
@@ -35,6 +37,13 @@ class FrameSequence:
     atlas: Atlas
     states: tuple[FrameState, ...]
     options: dict[str, Any] = field(default_factory=dict)  # settings of a bake that differ from the defaults
+
+    @property
+    def guide(self) -> tuple[FrameState, ...]:
+        """Frames spread evenly over the sequence, whose light tells where gather rays are aimed (``Session``)."""
+        count = len(self.states)
+        chosen = np.unique(np.linspace(0, count - 1, min(GUIDES, count)).round().astype(int))
+        return tuple(self.states[i] for i in chosen)
 
 
 def moved(scene: Scene, frame: int, places: dict[str, Float64]) -> FrameState:

@@ -205,7 +205,7 @@ def test_a_gather_in_a_furnace_brings_its_radiosity():
     mesh = box("room", (1, 1, 1), texels=4, inward=True)
     scene = Scene((mesh,), (Instance("room", 0, np.eye(4)),), (WHITE,))
     rig = make_rig(scene, grid_atlas(scene, [(18, 12)]))
-    odds = bright_targets([np.ones(rig.texels.count)])
+    odds = bright_targets([np.ones(rig.texels.count)], np.zeros(rig.texels.count, np.int32))
     tracer = GatherRays(
         rig.texels, rig.frame, rig.geometry, rig.surfaces, rig.tracer, None, odds, SampleCounts(16, 16),
         max_specular=0, seed=0,
@@ -221,7 +221,8 @@ def test_a_gather_in_a_furnace_brings_its_radiosity():
 
 MACHINE = Machine("A processor", 2, {"rtgi": "0.1.0"}, "0.3")
 COUNTS = {
-    "rays": 1000.0, "links_traced": 100.0, "links_kept": 900.0, "photons_traced": 0.0, "photons_kept": 0.0,
+    "rays": 1000.0, "links_traced": 100.0, "links_kept": 900.0, "links_tested": 250.0, "photons_traced": 0.0,
+    "photons_kept": 0.0,
     "texels_updated": 30.0, "texels_kept": 70.0, "surfaces_updated": 2.0, "surfaces_kept": 8.0,
 }  # fmt: skip
 
@@ -251,10 +252,11 @@ def test_the_report_of_frames_states_cost_error_and_what_is_met(tmp_path: Path) 
     text = (tmp_path / "benchmarks.md").read_text(encoding="utf-8")
     assert "| Sequence mover | 12000 | 40.0 | 80.0 | 300.0 | 7.5 | 25.0 | 2.10% | 2.00% | 3e-07 |" in text
     assert "| Sequence slow | 12000 | 40.0 | 80.0 | 300.0 | 7.5 | 25.0 | - | - | 3e-07 |" in text
-    assert "| Sequence mover | 1000 | 1000 | 90.0% | - | 30.0% | 2.0 of 10 |" in text
+    assert "| Sequence mover | 1k | 1k | 100 | 250 | 90.0% | 0 | - | 30.0% | 2.0 of 10 |" in text
     assert "| a mover, 12k texels: at least 20 frames/s | met | 25.0 |" in text
     assert "| a moving lamp: at least 10 frames/s, no gather ray | met | 12.5, 0 rays |" in text
     assert "| nothing changed: less than 5 ms and no ray | met | 4.0 ms, 0 rays |" in text
+    assert "| two closed rooms: no surface of the other room updated | met | 0.0 surfaces |" in text
     assert "| Larsen04's size, every texel in every frame: at most 10 ms | **missed** | 40.0 ms |" in text
     assert "| flicker far from a slow mover: at most 1% | met | 0.40% |" in text
     for quality in ("preview", "draft"):
