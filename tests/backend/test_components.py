@@ -137,6 +137,19 @@ def test_removing_what_is_not_there_is_refused_and_changes_nothing(kind):
             graph.add(*as_arrays([(row, target)]))
 
 
+def test_pairs_that_are_gone_take_no_memory(monkeypatch):
+    """An object that wanders past ever other surfaces: only the pairs it has are held."""
+    monkeypatch.setattr(components, "DENSE_SURFACES", 0)
+    graph = SurfaceGraph(1000)
+    graph.add(np.zeros(20, np.int32), np.arange(20, dtype=np.int32))
+    for first in range(0, 980, 20):
+        now = np.arange(first, first + 20, dtype=np.int32)
+        graph.remove(np.zeros(20, np.int32), now)
+        graph.add(np.zeros(20, np.int32), now + 20)
+        assert np.flatnonzero(graph.labels() == 0).tolist() == [0, *(now + 20)]
+        assert len(graph._keys) <= 60 and graph.count(0, first + 39) == 1 and graph.count(0, first + 19) == 0
+
+
 def test_no_surfaces(kind):
     graph = SurfaceGraph(0)
     graph.add(*as_arrays([]))

@@ -10,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rtgi_addon.backend.final_gather.products import row_products
-from rtgi_addon.backend.final_gather.solvers import conjugate_gradients, solve_fixed_point
+from rtgi_addon.backend.final_gather.solvers import _orthogonal, conjugate_gradients, solve_fixed_point
+from rtgi_addon.backend.final_gather.strands import Strands
 from rtgi_addon.backend.parallel import Workers
 
 
@@ -299,9 +300,54 @@ def test_warm_start_of_groups_multiplies_only_for_those_with_light():
     b = rng.random((240, 3)).astype(np.float32)
     b[group == 1] = 0
     cold = solve_fixed_point(operator_of(target, weight), b, group=group)
-    warm = solve_fixed_point(operator_of(target, weight), b, group=group, start=cold.x)
-    assert warm.products == 1 and not warm.x[group == 1].any()
+    first = np.where((group == 1)[:, None], np.float32(7), cold.x)  # the lamp there has gone out
+    warm = solve_fixed_point(operator_of(target, weight), b, group=group, start=first)
+    assert warm.products == 1 and warm.converged.all()
     same_bits(warm.x, cold.x)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_residual_never_grows_even_where_there_is_no_solution(seed):
+    """A closed white room: the operator's rows sum to 1."""
+    rng = np.random.default_rng(seed)
+    operator, _ = counted(links(rng, 400, sky=0))
+    b = rng.random((400, 1)).astype(np.float32)
+    solution = solve_fixed_point(operator, b)
+    assert not solution.converged.any() and solution.residual.max() <= 1 and np.abs(solution.x).max() < 1e4
+
+
+def test_no_step_along_a_direction_that_changes_nothing():
+    """One minus the mean of all has the constants as null vectors: only what differs from the mean can be met."""
+    b = np.random.default_rng(14).random((50, 3)).astype(np.float32)
+    mean = np.full((50, 50), 1 / 50)
+    solution = solve_fixed_point(lambda x: (mean @ x).astype(np.float32), b)
+    assert solution.products <= 4 and not solution.converged.any()
+    spread = np.linalg.norm(b.mean(axis=0) * np.ones((50, 1)), axis=0) / np.linalg.norm(b, axis=0)
+    np.testing.assert_allclose(solution.residual[0], spread, rtol=1e-4)
+    assert np.abs(solution.x).max() < 10
+
+
+def test_basis_is_orthogonal_though_most_of_a_product_lies_in_it():
+    rng = np.random.default_rng(15)
+    strands = Strands(None, 5000)
+    basis = strands.to_columns(np.linalg.qr(rng.normal(size=(5000, 6)))[0].astype(np.float32))[:, None]
+    inside = strands.combination(basis, rng.normal(size=(6, 1, 1)))
+    outside = strands.to_columns(rng.normal(size=(5000, 1)).astype(np.float32) * np.float32(1e-6))
+    vector, _, last = _orthogonal(strands, inside + outside, basis)
+    assert 5e-5 < last[0, 0] < 1e-4
+    assert np.abs(strands.projections(basis, vector)).max() < 2e-7 * last[0, 0]
+
+
+def test_sums_of_many_rows():
+    """The blocks' sums are added in float64: a float32 sum of half a million would be off in the eighth digit."""
+    rng = np.random.default_rng(16)
+    group = rng.integers(0, 3, 500_000).astype(np.int32)
+    values = (rng.random((500_000, 2)) + 1).astype(np.float32)
+    strands = Strands(group, len(group))
+    columns = strands.to_columns(values)
+    exact = [[np.dot(v := values[group == g, c].astype(np.float64), v) for g in range(3)] for c in range(2)]
+    np.testing.assert_allclose(strands.dots(columns, columns), exact, rtol=3e-9)
+    same_bits(np.ascontiguousarray(strands.to_rows(columns)), values)
 
 
 def test_not_finite_is_refused_in_rows_left_out_as_well():

@@ -58,7 +58,8 @@ def solve_fixed_point(
     and the operator on them: the bits are the same. ``max_products`` holds for each group.
 
     The residual never grows, and no other method that uses as many products reaches a smaller one between restarts.
-    ``start`` is a first guess, such as the frame before. Raises ValueError where b or a product is not finite.
+    Where 1 - operator is singular and no step helps, x is ``start`` (a first guess) or 0. Raises ValueError where b
+    or a product is not finite.
     """
     _require_finite(b.T, "the right-hand side")
     strands = Strands(group, len(b))
@@ -67,7 +68,7 @@ def solve_fixed_point(
     scale = np.where(length > 0, length, 1.0)
     x = np.zeros_like(rhs) if start is None else strands.scaled(strands.to_columns(start), 1 / unit)
     strands.clear(x, length == 0)
-    left = np.where(length > 0, 1.0, 0.0)
+    kept, left = x, np.where(length > 0, 1.0, 0.0)
     before = np.full(length.shape, np.inf)
     going, spent, products = length > 0, np.zeros(length.shape, np.intp), 0
 
@@ -83,13 +84,16 @@ def solve_fixed_point(
             spent += going
             left = np.where(going, strands.norms(residual) / scale, left)
         _require_finite(left, "the operator's product")
+        worse = left > before  # where 1 - M is singular, rounding alone gives a step: the x before it stands
+        x = strands.chosen(worse, kept, x)
+        left = np.where(worse, before, left)
         going &= (left > tolerance) & (left <= STAGNATION * before) & (spent < max_products)
         if not going.any():
             solved = strands.keep(strands.scaled(x, unit), b)
             return Solution(solved, products, strands.labels, left.T, left.T <= tolerance)
         limit = np.where(going, np.minimum(BASIS_SIZE, max_products - spent), 0)
         step, used = _gmres_cycle(product, strands, residual, tolerance * scale, limit)
-        x += step
+        kept, x = x, x + step
         products += int(used.max())
         spent += used
         before = left

@@ -105,6 +105,12 @@ class Strands:
         """factor (c, g) · vector."""
         return np.asarray(np.einsum("cb,cbk->cbk", self._by_block(factor), vector))
 
+    def chosen(self, where: Bool, a: Float32, b: Float32) -> Float32:
+        """a in the strands ``where`` (c, g), b in the others."""
+        if not where.any():
+            return b
+        return np.where(np.repeat(where, self._blocks, axis=1)[:, :, None], a, b)
+
     def clear(self, vector: Float32, where: Bool) -> None:
         """Zero in the strands ``where`` (c, g)."""
         if where.any():
