@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from rtgi_addon.backend.scene import Atlas, Instance, Placement, Scene
 from rtgi_addon.backend.surface.geometry import Geometry
 from rtgi_addon.backend.surface.rasterise import rasterise
-from rtgi_addon.backend.surface.texels import make_texels, place_texels, texel_colours
+from rtgi_addon.backend.surface.texels import make_texels, place_texels, stand_ins, texel_colours
 from tests.backend import scenes
 
 
@@ -125,3 +125,22 @@ def test_rectangle_that_leaves_its_page_is_refused():
     atlas = Atlas(16, 1, (Placement(0, (1.0, 1.0), (0.5, 0.0)),), (None,))
     with pytest.raises(ValueError, match="sheet"):
         texels_of(scene, atlas)
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.0, 0.02, 0.5, 0.98, 1.0]))
+def test_stand_ins_are_the_nearest_valid_texels_of_their_surface(seed, share):
+    _, texels, _ = texels_of(*scenes.cornell(24))
+    rng = np.random.default_rng(seed)
+    valid = rng.random(texels.count) >= share
+    found = stand_ins(texels, valid)
+    np.testing.assert_array_equal(found[valid], np.flatnonzero(valid))
+    place = np.stack([texels.row, texels.col], axis=1).astype(np.int64)
+    for lost in rng.permutation(np.flatnonzero(~valid))[:50]:
+        near = np.flatnonzero(valid & (texels.surface == texels.surface[lost]))
+        squared = ((place[near] - place[lost]) ** 2).sum(axis=1)
+        assert found[lost] == -1 if not len(near) else found[lost] in near[squared == squared.min()]
+    # What is hidden on other surfaces does not matter, nor which of several is taken.
+    kept = texels.surface == rng.integers(texels.surface_count)
+    other = np.where(kept, valid, rng.random(texels.count) >= 0.5)
+    np.testing.assert_array_equal(stand_ins(texels, other)[kept], found[kept])

@@ -26,6 +26,9 @@ FRONT, BACK = 0, 1
 #: The lookup image is widened by this many pixels, so that a hit on an island's border, moved over it by rounding,
 #: still finds the island's own texel.
 LOOKUP_BORDER_PX = 1
+#: Of several texels equally near, the tree would return one that depends on all its texels; so far off a pixel's
+#: middle none are equally near, and none that was further comes first.
+TIE_BREAK_PX = (1e-5, 6.180339887e-6, 0.0)
 
 
 @dataclass(frozen=True)
@@ -230,18 +233,19 @@ def _widened(index: Int32) -> Int32:
 
 def stand_ins(texels: Texels, valid: Bool) -> Int32:
     """(n,) the texel whose light stands for each: itself where ``valid``, else the nearest valid one of its surface on
-    the page; -1 where its surface has none."""
+    the page; -1 where its surface has none. Each surface by itself: what is hidden elsewhere does not matter."""
     source = np.arange(texels.count, dtype=np.int32)
-    lost, good = np.nonzero(~valid)[0], np.nonzero(valid)[0]
-    if not len(lost):
-        return source
+    lost = np.flatnonzero(~valid)
     source[lost] = -1
-    if not len(good):
+    hidden = np.zeros(texels.surface_count, np.bool_)
+    hidden[texels.surface[lost]] = True
+    good = np.flatnonzero(valid & hidden[texels.surface])
+    if not len(lost) or not len(good):
         return source
     # Surfaces lie so far apart along the third axis that the nearest texel is one's own surface's if it has any.
     apart = 4.0 * max(texels.index.shape[1:])
     place = np.stack([texels.row, texels.col, texels.surface * apart], axis=1).astype(np.float64)
-    _, nearest = cKDTree(place[good]).query(place[lost])
+    _, nearest = cKDTree(place[good]).query(place[lost] + TIE_BREAK_PX)
     own = texels.surface[good[nearest]] == texels.surface[lost]
     source[lost[own]] = good[nearest[own]]
     return source
