@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.lamps.direct import direct_irradiance, make_shadows
+from rtgi_addon.backend.lamps.direct import direct_irradiance, make_receivers, make_shadows
 from rtgi_addon.backend.lamps.direct_store import DirectStore, DirectUpdate
 from rtgi_addon.backend.lamps.lights import is_dark
 from rtgi_addon.backend.lamps.shading_balls import MOST_BALLS, Balls, may_shade, together
@@ -57,6 +57,8 @@ class Bake:
             samples=self.samples,
             seed=SEED,
         )
+        kept, made = self.store._now.receivers, make_receivers(frame, self.geometry, samples=self.samples)
+        assert kept.offset.tobytes() == made.offset.tobytes() and kept.reach.tobytes() == made.reach.tobytes()
         fresh, self.fresh_rays = direct_irradiance(
             state.lights, frame, shadows, self.workers, samples=self.samples, seed=SEED
         )
@@ -140,8 +142,18 @@ def test_only_the_lamp_that_changed_is_traced() -> None:
     ):
         update = bake.lit_by(first, light)
         assert 0 < update.rays <= alone * 1.2 and (update.lamps_updated, update.lamps_kept) == (1, 1)
-    assert bake.lit_by(first, replace(second, casts_shadow=False)).rays == 0  # computed anew, but without rays
+    free = replace(bake.state.lights[1], casts_shadow=False)
+    update = bake.lit_by(first, free)
+    assert (update.rays, update.lamps_updated) == (0, 1) and update.changed.any()  # computed anew, but without rays
     assert bake.moved(8, 0.1, 0, 0).rays < 0.5 * alone
+
+
+@pytest.mark.parametrize("spread", [3.0, 1.5])
+def test_the_shape_of_an_area_lamp_counts(spread: float) -> None:
+    bake = room(replace(LAMPS["area"], matrix_world=translation(0, 0, 1.8)))
+    (lamp,) = bake.state.lights
+    for light in (replace(lamp, spread=spread), replace(lamp, size=(0.4, 1.0)), replace(LAMPS["ellipse"])):
+        assert bake.lit_by(light).changed.any()
 
 
 def test_a_sun_may_stand_anywhere() -> None:
@@ -188,6 +200,16 @@ def test_a_dark_lamp_learns_what_it_missed() -> None:
     assert 0 < update.rays < 0.4 * bake.fresh_rays
     assert bake.lit_by(replace(lamp, power=BLACK)).rays == 0
     assert bake.lit_by(replace(lamp, radius=0.3)).rays == bake.fresh_rays  # it came back as another
+
+
+def test_a_dark_lamp_without_shadows_learns_which_texels_moved() -> None:
+    bake = room(replace(soft(), casts_shadow=False))
+    (lamp,) = bake.state.lights
+    bake.lit_by(replace(lamp, power=BLACK))
+    for crate in (8, 9):
+        bake.moved(crate, 0.1, 0.05, 0.3)
+    update = bake.lit_by(lamp)
+    assert update.rays == 0 and update.lamps_updated == 1
 
 
 def test_many_movers_are_taken_together() -> None:
@@ -297,6 +319,11 @@ def test_after_an_interrupted_update_nothing_is_kept(monkeypatch: pytest.MonkeyP
         with pytest.raises(Fault):
             bake.moved(8, 0.1, 0.1, 0)
     assert bake.change().rays == bake.fresh_rays
+    with monkeypatch.context() as patch:
+        patch.setattr(bake.tracer, "occluded", fail)
+        with pytest.raises(Fault):
+            bake.moved(8, 0.1, 0.1, 0)
+    assert not bake.lit_by().direct.any()
 
 
 # --- the balls ----------------------------------------------------------------------------------------------------
