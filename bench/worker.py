@@ -16,7 +16,7 @@ from rtgi_addon.backend.finish.oidn import Denoiser, find_oidn
 from rtgi_addon.backend.scene import Bool, Float32, Int32
 from rtgi_addon.backend.session import FrameResult, Session
 from rtgi_addon.backend.settings import SampleCounts
-from rtgi_addon.backend.surface.texels import Texels
+from rtgi_addon.backend.surface.texels import Texels, stand_ins
 from rtgi_addon.environment import device, library_folders, versions
 
 from .baking import settings_of
@@ -103,7 +103,8 @@ def serve_cycles(connection: Connection, scene: BenchScene) -> None:
     meter = Meter()
     baker = CyclesBake(subject.prepared, subject.texels, meter)
     with Denoiser(library) as oidn:
-        denoiser = MapDenoiser(oidn, subject.texels.index, subject.texels.surface)
+        texels = subject.texels
+        denoiser = MapDenoiser(oidn, texels.index, texels.surface, 2 * texels.instance + texels.side)
         denoiser.denoise(baker.run(4, 99)[0])
         connection.send(_hello(subject))
         _serve(connection, lambda method, seed: _run_cycles(subject, meter, baker, denoiser, method, seed))
@@ -114,7 +115,8 @@ def _run_cycles(
 ) -> list[Run]:
     values, cost = baker.run(method.samples, seed)
     # What Cycles left black lies under geometry, or on a border; the filter is not shown it, as it is not RTGI's.
-    filtered, extra = meter.measured(lambda: denoiser.denoise(values, valid=values.any(axis=1)))
+    shown = stand_ins(subject.texels, values.any(axis=1))
+    filtered, extra = meter.measured(lambda: denoiser.denoise(values, stand_in=shown))
     peaks = [c.peak_bytes for c in (cost, extra) if c.peak_bytes is not None]
     both = Cost(cost.seconds + extra.seconds, max(peaks, default=None))
     return [
