@@ -64,8 +64,8 @@ def test_integrating_sphere_closed_form(albedo):
 
 def test_fewer_products_than_bounces():
     rng = np.random.default_rng(2)
-    matrix = 0.99 * links(rng, 800)
-    b = rng.random((800, 3)).astype(np.float32)
+    matrix = 0.99 * links(rng, 300)
+    b = rng.random((300, 3)).astype(np.float32)
     operator, calls = counted(matrix)
     solution = solve_fixed_point(operator, b, tolerance=1e-4)
     x, bounces = b.astype(np.float64), 0
@@ -246,6 +246,22 @@ def test_groups_that_restart_keep_their_bits_beside_groups_that_end_at_once():
     same_bits(together.residual, np.concatenate([other.residual, corridor.residual]))
 
 
+def test_a_group_does_not_spend_the_products_of_another():
+    """A corridor that takes a whole cycle beside a nearly white room that takes a short one and more after it."""
+    rng = np.random.default_rng(17)
+    near = (np.arange(700)[:, None] + np.arange(-3, 4)).clip(0, 699).astype(np.int32)
+    room, weight, _ = block_diagonal(rng, [400], albedo=0.9999)
+    target = np.concatenate([near, room + 700]).astype(np.int32)
+    weight = np.concatenate([np.full((700, 7), 0.999 / 7, np.float32), weight])
+    b = rng.random((1100, 1)).astype(np.float32)
+    b[:700] **= 20
+    group = np.repeat([0, 1], [700, 400]).astype(np.int32)
+    together = solve_fixed_point(operator_of(target, weight), b, group=group, max_products=28, tolerance=1e-5)
+    alone = solve_fixed_point(operator_of(room, weight[700:]), b[700:], max_products=28, tolerance=1e-5)
+    assert alone.products > 14 and not together.converged[0, 0]
+    same_bits(together.x[700:], alone.x)
+
+
 def test_most_products_hold_for_each_group():
     rng = np.random.default_rng(9)
     target, weight, group = block_diagonal(rng, [90, 400, 30], albedo=0.999)
@@ -314,6 +330,14 @@ def test_the_residual_never_grows_even_where_there_is_no_solution(seed):
     b = rng.random((400, 1)).astype(np.float32)
     solution = solve_fixed_point(operator, b)
     assert not solution.converged.any() and solution.residual.max() <= 1 and np.abs(solution.x).max() < 1e4
+    room, weight, _ = block_diagonal(rng, [100])
+    beside = solve_fixed_point(
+        lambda x: np.concatenate([operator(x[:400]), operator_of(room, weight)(x[400:])]),
+        np.concatenate([b, b[:100]]),
+        group=np.repeat([0, 1], [400, 100]).astype(np.int32),
+    )
+    same_bits(beside.x[:400], solution.x)
+    same_bits(beside.x[400:], solve_fixed_point(operator_of(room, weight), b[:100]).x)
 
 
 def test_no_step_along_a_direction_that_changes_nothing():

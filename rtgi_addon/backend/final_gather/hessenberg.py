@@ -39,7 +39,7 @@ class HessenbergLeastSquares:
         last = self._rhs.pop()
         self._rhs += [cos * last, -sin * last]
         self.residual = np.where(taken, np.abs(self._rhs[-1]), self.residual)
-        self.ended = self.ended | (active & ((h[-1] == 0.0) | ~taken))
+        self.ended = self.ended | (active & ~taken)
         self._taken += taken
 
     def solve(self) -> Float64:
