@@ -23,7 +23,7 @@ from .extract.source_scene import frame_kept
 from .lightmap_nodes import make_group, remove_group
 from .lightmap_sampling import MARK, OFFSET_PROPERTIES, SCALE_PROPERTIES, UV_LAYER, MapFiles
 from .lightmap_slots import light_materials, unlight_materials
-from .motion import Motion, motions, span_shown, to_rigid
+from .motion import Motion, held, motions, span_shown, to_rigid
 from .point_cache import play_pc2, write_pc2
 from .source import Layout, SourceScene
 from .standins import Survey, add_object, hide_originals, make_mesh, remove_standins, survey
@@ -130,8 +130,9 @@ def _motions(
     lamps = {}
     for number, light in enumerate(source.lights):
         if light.name in found.lamps:
-            matrices = np.array([state.lights[number].matrix_world for state in read])
-            lamps[light.name] = Motion(matrices, np.isin([s.frame for s in read], source.lamp_frames[number]))
+            shown = np.isin([state.frame for state in read], source.lamp_frames[number])
+            matrices = np.array([read[i].lights[number].matrix_world for i in held(shown)])
+            lamps[light.name] = Motion(matrices, shown)
     return motions(source, read, chosen), lamps
 
 

@@ -30,15 +30,15 @@ def motions(source: SourceScene, states: Sequence[FrameState], chosen: Sequence[
         instance = source.instances[index]
         rest = source.meshes[instance.mesh].vertices
         shown = np.array([s.visible[index] for s in states])
-        at = _held(shown)
+        at = held(shown)
         vertices = [states[i].vertices.get(instance.mesh, rest) for i in at] if instance.deforming else None
         out[index] = Motion(np.array([states[i].matrix_world[index] for i in at]), shown, vertices)
     return out
 
 
-def _held(shown: NDArray[np.bool_]) -> list[int]:
-    """For each frame the nearest one before in which the object is ``shown``, else the first of all: what vanishes
-    must not be on its way to somewhere else in the frames between."""
+def held(shown: NDArray[np.bool_]) -> list[int]:
+    """For each frame the nearest one before in which it is ``shown``, else the first of all: what vanishes must not
+    be on its way to somewhere else in the frames between."""
     last = np.maximum.accumulate(np.where(shown, np.arange(len(shown)), -1))
     first = int(np.argmax(shown))
     return [first if i < 0 else i for i in last.tolist()]

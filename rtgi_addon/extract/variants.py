@@ -72,10 +72,12 @@ def coarseness(
     meshes: Sequence[SourceMesh], instances: Sequence[Instance], objects: Mapping[str, Sequence[int]]
 ) -> str:
     """What is to be told of ``objects``, the numbers of each one's instances by name: "" where maps hardly suffer."""
+    if all(len(v) == 1 for v in objects.values()):
+        return ""
     area = np.array([world_area(meshes[i.mesh], i.matrix_world[:3, :3]) for i in instances])
     extra = {name: float(area[list(v)].sum() - area[list(v)].max()) for name, v in objects.items() if len(v) > 1}
     alone = float(area.sum()) - sum(extra.values())
-    if not extra or alone <= 0 or (coarser := (float(area.sum()) / alone) ** 0.5) < COARSER_UNTOLD:
+    if alone <= 0 or (coarser := (float(area.sum()) / alone) ** 0.5) < COARSER_UNTOLD:
         return ""
     worst = max(extra, key=lambda name: extra[name])
     others = f" (and {len(extra) - 1} more objects alike)" if len(extra) > 1 else ""

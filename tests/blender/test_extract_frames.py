@@ -142,6 +142,25 @@ def test_objects_appear_and_vanish(add_cube: AddObject) -> None:
     assert source.first_frames[late] == 3
 
 
+def test_instances_by_geometry_nodes_appear_and_vanish(add_mesh: AddObject) -> None:
+    """As many quads in a row as the frame says."""
+    tree = bpy.data.node_groups.new("Row", "GeometryNodeTree")
+    tree.interface.new_socket("Geometry", in_out="OUTPUT", socket_type="NodeSocketGeometry")
+    names = ("InputSceneTime", "MeshLine", "MeshGrid", "InstanceOnPoints")
+    clock, line, grid, put = (tree.nodes.new(f"GeometryNode{name}") for name in names)
+    end = tree.nodes.new("NodeGroupOutput")
+    tree.links.new(clock.outputs["Frame"], line.inputs["Count"])
+    tree.links.new(line.outputs[0], put.inputs["Points"])
+    tree.links.new(grid.outputs[0], put.inputs["Instance"])
+    tree.links.new(put.outputs[0], end.inputs[0])
+    add_mesh("Row", [(0, 0, 0)], []).modifiers.new("Nodes", "NODES").node_group = tree
+    source = extract_source([1, 3, 2], silent)
+    assert [i.name for i in source.instances] == ["Row", "Row#2", "Row#3"]
+    assert [i.moving for i in source.instances] == [False, True, True]
+    assert [at(source, frame).visible.sum() for frame in (1, 2, 3)] == [1, 2, 3]
+    assert at(source, 3).matrix_world[:, 2, 3] == pytest.approx([0, 1, 2])
+
+
 def test_lamps_move_and_change(add_cube: AddObject) -> None:
     add_cube()
     data = bpy.data.lights.new("Lamp", "POINT")

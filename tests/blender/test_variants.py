@@ -210,6 +210,24 @@ def test_shading_normals_that_change_are_followed(add_plane: AddObject) -> None:
     assert not np.allclose(normals, source.meshes[0].corner_normals, atol=0.1)
 
 
+def test_edges_that_turn_sharp_are_followed(add_cube: AddObject) -> None:
+    """The vertices stand still and no normals are custom."""
+    cube = add_cube("Edgy")
+    cube.data.shade_smooth()
+    cube.data.attributes.new("sharp_edge", "BOOLEAN", "EDGE")
+
+    def sharpen(frame: int) -> None:
+        cube.data.attributes["sharp_edge"].data.foreach_set("value", [frame == 2] * 12)
+        cube.data.update()
+
+    with each_frame(sharpen):
+        source = extract_source([1, 2], silent)
+        assert source.instances[0].deforming
+        assert abs(source.meshes[0].corner_normals).max() == pytest.approx(3**-0.5, abs=1e-3)  # along the diagonals
+        assert abs(at(source, 2).corner_normals[0]).max() == pytest.approx(1.0)
+        assert not extract_source([1, 3], silent).instances[0].deforming
+
+
 def test_what_vanishes_altogether_is_no_variant(add_plane: AddObject) -> None:
     """A build modifier that has not begun has no faces at all."""
     plane = add_plane("Built")
