@@ -21,7 +21,7 @@ def test_cells_make_groups_of_about_the_size_asked_for(count: int, size: int) ->
     assert np.log2(halves) % 1 == 0 and 3 ** round(np.log(thirds) / np.log(3)) == thirds
     assert halves * thirds <= count and max(halves, thirds) <= 4 * min(halves, thirds)
     if count >= 12 * size:
-        assert 1 / 1.6 < count / (halves * thirds) / size < 1.6
+        assert 1 / 2 < count / (halves * thirds) / size < 2
 
 
 @pytest.mark.parametrize("seed", [0, 7])
