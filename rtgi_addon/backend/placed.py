@@ -43,7 +43,7 @@ class PlacedScene:
         self.texels = make_texels(scene, atlas, self.geometry)
         self.frame = place_texels(self.texels, self.geometry)
         self._layout = sky_layout(s.world for s in (state, *guide))
-        self._workers = workers
+        self.workers = workers
         self.state = state
         self._colour(state)
         self._shine(state)
@@ -65,7 +65,7 @@ class PlacedScene:
         if self.surfaces is not surfaces or state.world is not before.world:
             self._shine(state)
         return Change(
-            sweep=Sweep(movement.places, moved, self._workers),
+            sweep=Sweep(movement.places, moved, self.workers),
             texels=texels,
             scattering=np.any(self.albedo != albedo, axis=1) if self.albedo is not albedo else None,
             passing=not _pass_alike(surfaces, self.surfaces),

@@ -16,16 +16,22 @@ import numpy as np
 
 from .final_gather import radiosity
 from .final_gather.bright import BrightTargets, bright_targets, bright_weight
+from .final_gather.components import SurfaceGraph
 from .final_gather.lighting import Light, Lighting
+from .final_gather.rooms import look_around, rooms_of
 from .finish.finisher import Finisher, OidnOpening, fill
 from .lamps import emission
-from .lamps.direct import direct_irradiance, make_shadows
+from .lamps.direct import make_shadows
+from .lamps.direct_store import DirectStore
 from .limits import bounded_scene, bounded_state
 from .parallel import Workers
-from .photon import caustics, photon_map, photons
+from .photon import caustics
+from .photon.photon_light import Hits, PhotonLight
+from .photon.photon_store import PhotonStore
 from .placed import PlacedScene
 from .progress import Report, silent
 from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
+from .selection.changes import Change
 from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts, Selection
 from .stats import FrameStats
 from .surface.geometry import Geometry
@@ -92,9 +98,20 @@ class Session:
         self._placed = PlacedScene(scene, atlas, states[0], states[1:], self._workers)
         self._bounds = emission.make_bounds(self._placed.geometry)
         self._sides = sending_sides(scene, atlas)
+        self._direct_store = DirectStore()
+        self._photons = self._photon_light(diffuse=True)
+        self._caustic_photons = self._photon_light(diffuse=False)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
+        self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
         self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers)
+
+    def _photon_light(self, *, diffuse: bool) -> PhotonLight:
+        most = self.settings.max_bounces if diffuse else self.settings.max_specular + 1
+        store = PhotonStore(
+            self.texels, selection=self.settings.selection, max_bounces=most, seed=self.settings.seed, diffuse=diffuse
+        )
+        return PhotonLight(store, nearest=self.settings.nearest_photons)
 
     @property
     def texels(self) -> Texels:
@@ -121,16 +138,18 @@ class Session:
 
     def advance(self, state: FrameState) -> FrameResult:
         """Light the frame ``state``."""
-        stats = FrameStats()
+        stats, self._setup = self._setup or FrameStats(), None
+        traced_in_setup, stats.photons_kept = stats.photons_traced, 0
         state, bounded = bounded_state(state, self.scene)
         stats.warnings += dict.fromkeys([*self._bounded, *bounded])
         with stats.stage("place"):
             change = self._placed.follow(state)
             if self.settings.selection is Selection.OFF:
                 self._lighting.forget()
+                self._direct_store.clear()
             self._lighting.follow(self._placed, change, stats)
         self._report("place", 1, STAGE_COUNT)
-        outside, caustic = self._outside(stats)
+        outside, caustic = self._outside(change, stats)
         lit = self._illuminate(outside, self._first_samples(), stats)
         while (more := self._more_samples(lit, stats)) is not None:
             lit = self._illuminate(outside, more, stats)
@@ -140,6 +159,7 @@ class Session:
             maps = self._pages(lit, iim, caustic)
         self._report("pages", STAGE_COUNT, STAGE_COUNT)
         self._count(lit.light.updated, stats)
+        stats.photons_kept = max(stats.photons_kept - traced_in_setup, 0)
         stats.estimated_error = lit.estimated_error
         stats.warnings += self._finisher.warnings
         return FrameResult(maps, stats)
@@ -170,11 +190,12 @@ class Session:
             links = lighting.links(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
         with stats.stage("aim"):
-            light = lighting.light(placed, links, samples, outside, self._photon_aim(outside, stats))
+            light = lighting.light(placed, links, samples, outside, self._photon_aim(outside))
         self._report("aim", 5, STAGE_COUNT)
         with stats.stage("denoise"):
-            iim = self._finisher.denoise(light.iim, light.stand_in)
-            estimate = noise_estimate(iim, self._finisher.denoise(light.half, light.stand_in))
+            end, apart = self._finisher, light.component
+            iim = end.denoise(light.iim, light.stand_in, component=apart)
+            estimate = noise_estimate(iim, end.denoise(light.half, light.stand_in, component=apart, half=True))
         return _Lit(placed.state.frame, samples, light, iim, estimate)
 
     def _count(self, updated: Bool, stats: FrameStats) -> None:
@@ -189,81 +210,74 @@ class Session:
 
     def _guide(self, states: Sequence[FrameState]) -> BrightTargets:
         """Where gather rays are aimed: at what shines in any of ``states``."""
-        placed, weights = self._placed, []
+        assert self._setup is not None
+        placed, weights, setup = self._placed, [], self._setup
+        seen = SurfaceGraph(self.texels.surface_count)
         for state in reversed(states):
-            placed.follow(state)
-            outside, _ = self._outside(FrameStats())
+            change = placed.follow(state)
+            setup.rays += look_around(placed, seen, self.settings.seed)
+            outside, _ = self._outside(change, setup)
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
             weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
-        return bright_targets(weights)
+        return bright_targets(weights, rooms_of(seen, self.texels.surface))
 
-    def _outside(self, stats: FrameStats) -> tuple[Float32, Float32 | None]:
+    def _outside(self, change: Change, stats: FrameStats) -> tuple[Float32, Float32 | None]:
         """((n, 3) all light that does not come by links, (n, 3) of it caustics or None)."""
+        if self._uses_photons:
+            with stats.stage("photons"):
+                self._follow_photons(change, stats)
         with stats.stage("direct"):
-            direct = self._direct(stats)
+            direct = self._direct(change, stats)
         self._report("direct", 2, STAGE_COUNT)
         with stats.stage("caustics"):
-            caustic = self._caustics(stats)
+            caustic = self._caustics(change, stats)
         self._report("caustics", 3, STAGE_COUNT)
         return (direct if caustic is None else direct + caustic), caustic
 
-    def _direct(self, stats: FrameStats) -> Float32:
+    @property
+    def _uses_photons(self) -> bool:
+        return AimDirect.PHOTONS is self.settings.aim_direct or AimBounced.PHOTONS is self.settings.aim_bounced
+
+    def _follow_photons(self, change: Change, stats: FrameStats) -> None:
+        placed = self._placed
+        bounds = emission.grown_bounds(self._bounds, placed.geometry)
+        sources = emission.make_sources(self.scene, placed.state, placed.geometry, bounds, sides=self._sides)
+        counts = emission.photon_counts(sources, self.settings.photons)
+        self._photons.follow(placed, change, sources, counts, stats)
+
+    def _direct(self, change: Change, stats: FrameStats) -> Float32:
         """(n, 3) from lamps, by shadow rays; by photons when the settings say so."""
         placed = self._placed
         if self.settings.aim_direct is AimDirect.PHOTONS:
-            paths = self._photons(stats)
-            return self._density(paths, photon_map.direct_hits(paths) & photon_map.lamp_hits(paths))
-        shadows = make_shadows(placed.tracer, placed.geometry, placed.materials)
-        direct, rays = direct_irradiance(
-            placed.state.lights, placed.frame, shadows, self._workers,
+            return self._photons.irradiance(placed, Hits.DIRECT)
+        done = self._direct_store.update(
+            placed.state.lights, placed.frame, make_shadows(placed.tracer, placed.geometry, placed.materials),
+            self._workers, sweep=None if change.everything else change.sweep, changed_texels=change.texels,
             samples=self.settings.direct_samples, seed=self.settings.seed,
         )  # fmt: skip
-        stats.rays += rays
-        return direct
+        stats.rays += done.rays
+        return done.direct
 
-    def _caustics(self, stats: FrameStats) -> Float32 | None:
+    def _caustics(self, change: Change, stats: FrameStats) -> Float32 | None:
         """(n, 3) from lamps by way of mirrors and glass; None where the scene has none, or they are not asked for."""
         if self.settings.caustics is Caustics.OFF:
             return None
         placed = self._placed
-        generators = caustics.find_generators(self.scene, placed.state, self.geometry, placed.materials)
-        sources = caustics.caustic_sources(placed.state, self.geometry, self._bounds, generators)
-        if not sources:
-            return np.zeros_like(placed.albedo) if self.settings.caustics is Caustics.ON else None
-        paths, book = caustics.trace_caustics(
-            sources, photons=self.settings.photons, surfaces=placed.surfaces, tracer=self._placed.tracer,
-            workers=self._workers, max_bounces=self.settings.max_specular + 1, seed=self.settings.seed,
-        )  # fmt: skip
-        stats.rays += book.rays
-        stats.photons_traced += len(paths.light)
-        k = self.settings.nearest_photons
-        return caustics.caustic_irradiance(paths, self.texels, placed.frame, self._workers, k=k)
+        generators = caustics.find_generators(self.scene, placed.state, placed.geometry, placed.materials)
+        bounds = emission.grown_bounds(self._bounds, placed.geometry)
+        sources = caustics.caustic_sources(placed.state, placed.geometry, bounds, generators)
+        counts = emission.photon_counts(sources, self.settings.photons)
+        self._caustic_photons.follow(placed, change, sources, counts, stats)
+        if not sources and self.settings.caustics is not Caustics.ON:
+            return None
+        return self._caustic_photons.irradiance(placed, Hits.CAUSTIC)
 
-    def _photon_aim(self, outside: Float32, stats: FrameStats) -> Float32 | None:
+    def _photon_aim(self, outside: Float32) -> Float32 | None:
         """(n, 3) all light as photons tell it; None where radiosity's fixed point does."""
         if self.settings.aim_bounced is not AimBounced.PHOTONS:
             return None
-        paths = self._photons(stats)
         # Lamps' light is in `outside` until it has bounced diffusely; all of sky's and emissive meshes' is here.
-        return outside + self._density(paths, photon_map.bounced_hits(paths) | ~photon_map.lamp_hits(paths))
-
-    def _photons(self, stats: FrameStats) -> photons.PhotonPaths:
-        placed = self._placed
-        sources = emission.make_sources(self.scene, placed.state, self.geometry, self._bounds, sides=self._sides)
-        counts = emission.photon_counts(sources, self.settings.photons)
-        light, index = emission.all_photons(counts)
-        paths, book = photons.trace_photons(
-            sources, counts, light, index, surfaces=placed.surfaces, tracer=self._placed.tracer, workers=self._workers,
-            max_bounces=self.settings.max_bounces, seed=self.settings.seed,
-        )  # fmt: skip
-        stats.rays += book.rays
-        stats.photons_traced += len(paths.light)
-        return paths
-
-    def _density(self, paths: photons.PhotonPaths, hits: Bool) -> Float32:
-        found = photon_map.make_photon_map(paths, hits)
-        k = self.settings.nearest_photons
-        return photon_map.photon_irradiance(found, self.texels, self._placed.frame, self._workers, k=k)
+        return outside + self._photons.irradiance(self._placed, Hits.BOUNCED)
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end = self._finisher

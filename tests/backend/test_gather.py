@@ -9,7 +9,7 @@ import pytest
 from rtgi_addon.backend.final_gather.bright import bright_targets, bright_weight
 from rtgi_addon.backend.final_gather.gather import NO_TARGET, GatherRays
 from rtgi_addon.backend.final_gather.link_store import LinkStore
-from rtgi_addon.backend.final_gather.links import Links
+from rtgi_addon.backend.final_gather.links import make_links
 from rtgi_addon.backend.lamps.sky import make_sky
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.photon.scatter import make_surfaces
@@ -33,7 +33,8 @@ def gather_of(scene, atlas, radiosity, samples, *, seed=0):
     known[: texels.count] = radiosity(texels, frame)[:, None] if radiosity else 0
     if sky:
         known[texels.count :] = sky.radiance * np.pi
-    bright = bright_targets([bright_weight(known, frame.area, sky, geometry.extent)])
+    one_room = np.zeros(texels.count, np.int32)
+    bright = bright_targets([bright_weight(known, frame.area, sky, geometry.extent)], one_room)
     tracer = EmbreeTracer(scene, geometry, state, Workers(1))
     surfaces = make_surfaces(geometry, texels, albedo, scene.materials)
     rays = GatherRays(texels, frame, geometry, surfaces, tracer, sky, bright, samples, max_specular=4, seed=seed)
@@ -43,7 +44,7 @@ def gather_of(scene, atlas, radiosity, samples, *, seed=0):
 def links_of(rays, *, memory=1 << 30):
     store = LinkStore(rays, Workers(1), memory=memory)
     store.renew(rays, all_of(rays))
-    return Links(store, rays, Workers(1))
+    return make_links(store, rays, Workers(1))
 
 
 def all_of(rays):

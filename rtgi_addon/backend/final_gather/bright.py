@@ -14,19 +14,24 @@ from ..scene import Float32, Float64, Int32
 
 @dataclass(frozen=True)
 class BrightTargets:
-    """What aimed samples choose from: the probability of each of the m targets."""
+    """What aimed samples of n texels choose from: the odds of each of the m targets, other ones in each of r rooms."""
 
-    probability: Float32  # (m,) sums to one
-    cdf: Float64  # (m + 1,)
+    room: Int32  # (n,) of each texel
+    probability: Float32  # (r, m) sums to one in each room, or to zero in all
+    cdf: Float64  # (r, m + 1)
 
     @property
     def any(self) -> bool:
-        return bool(self.cdf[-1] > 0)
+        return bool(self.cdf[0, -1] > 0)
+
+    @property
+    def room_count(self) -> int:
+        return len(self.cdf)
 
     def targets(self, choice: Float32) -> Int32:
-        """(n,) the target that each number (n,) in [0, 1) chooses."""
-        chosen = np.searchsorted(self.cdf, choice, side="right") - 1
-        return np.clip(chosen, 0, max(len(self.probability) - 1, 0)).astype(np.int32)
+        """(r, k) the target that each number (k,) in [0, 1) chooses in each room."""
+        chosen = np.stack([np.searchsorted(cdf, choice, side="right") - 1 for cdf in self.cdf])
+        return np.asarray(np.clip(chosen, 0, max(self.probability.shape[1] - 1, 0)), np.int32)
 
 
 def bright_weight(radiosity: Float32, area: Float32, sky: Sky | None, extent: float) -> Float64:
@@ -46,16 +51,24 @@ def bright_weight(radiosity: Float32, area: Float32, sky: Sky | None, extent: fl
     return weight / total if total > 0 else weight
 
 
-def bright_targets(weights: Sequence[Float64]) -> BrightTargets:
+def bright_targets(weights: Sequence[Float64], room: Int32) -> BrightTargets:
     """Odds for a whole bake: the mean of the ``weights`` (m,) of its guide states, of those that have light.
 
     What is lit in one frame and dark in the next is aimed at in both: odds that followed the light would make every
-    aimed ray another one whenever a lamp moves.
+    aimed ray another one whenever a lamp moves. room (n,) of each texel, see ``rooms``: samples are aimed at targets of
+    the texel's own room and at the sky; those of room 0, and of rooms without any light, at all.
     """
-    weight = np.sum(weights, axis=0)
-    total = weight.sum()
-    if not total > 0:
-        return BrightTargets(np.zeros(len(weight), np.float32), np.zeros(len(weight) + 1))
-    cdf = np.concatenate([[0.0], np.cumsum(weight) / total])
-    cdf[1:][cdf[1:] == cdf[-1]] = 1.0
-    return BrightTargets((weight / total).astype(np.float32), cdf)
+    mean = np.sum(weights, axis=0)
+    count = int(room.max(initial=0)) + 1
+    of_room = np.zeros((count, len(mean)))
+    for number in range(count):
+        of_room[number] = mean
+        of_room[number, : len(room)][room != number] *= number == 0
+        if not of_room[number].any():
+            of_room[number] = mean
+    total = of_room.sum(axis=1, keepdims=True)
+    odds = np.divide(of_room, total, out=np.zeros_like(of_room), where=total > 0)
+    cdf = np.concatenate([np.zeros((count, 1)), np.cumsum(odds, axis=1)], axis=1)
+    # A number just below one must land on the last target that has odds, not behind it.
+    cdf[:, 1:][(cdf[:, 1:] == cdf[:, -1:]) & (total > 0)] = 1.0
+    return BrightTargets(room, odds.astype(np.float32), cdf)

@@ -27,10 +27,10 @@ from ..settings import SampleCounts
 from ..surface.geometry import Geometry
 from ..surface.rasterise import POINTS
 from ..surface.texels import TexelFrame, Texels
-from ..surface.tracing import Hits, Tracer
+from ..surface.tracing import FREE, WALL, Hits, Tracer
 from .aims import Aims, place_aims, target_density
 from .bright import BrightTargets
-from .patterns import bright_patterns, cosine_patterns, pattern_of_texels
+from .patterns import PATTERNS, bright_patterns, cosine_patterns, pattern_of_texels
 
 NO_TARGET = -1
 
@@ -54,8 +54,8 @@ class AimedRays:
     """r samples aimed at bright targets. A direction's length is the distance; the sky's are unit."""
 
     start: Int32  # (r,)
-    target: Int32  # (r,)
-    weight: Float32  # (r,) zero where the target does not face the texel or is hidden
+    target: Int32  # (r,) NO_TARGET where it faces away, or where a wall hides it that no moving object can lift
+    weight: Float32  # (r,) zero there, and where what moves hides it
     cast: int  # rays traced
 
 
@@ -107,10 +107,12 @@ class GatherRays:
         self._tracer, self._surfaces, self._sky = tracer, surfaces, sky
         self._max_specular, self._seed = max_specular, seed
         self._see_through = bool(surfaces.passes.any())
-        self._density = target_density(bright, frame.area, sky)
+        self._density = target_density(bright, frame.area, sky).reshape(-1)
+        self._first_density = bright.room * np.int32(self.target_count)  # (n,) of each texel's room
         tangent, bitangent = frames(frame.normal)
         self.axes = [np.ascontiguousarray(a.T) for a in (tangent, bitangent, frame.normal)]  # (3, n) each
         self.pattern = pattern_of_texels(texels.page, texels.row, texels.col, seed)
+        self.aim_pattern = bright.room * np.int32(PATTERNS) + self.pattern
         self.cosine_table = cosine_patterns(samples.cosine, seed)
         self.bright_table = bright_patterns(samples.bright, seed) if self.n_bright else None
         self.aims: Aims | None = None
@@ -164,7 +166,9 @@ class GatherRays:
         weight = np.full(len(texel), 1 / np.float32(self.n_cosine), np.float32)
         if self.n_bright:
             per_area = hits.distance * hits.distance / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
-            density = self._density.take(target, mode="clip") * np.where(escaped, np.float32(1), per_area)
+            density = self._density.take(self._first_density.take(texel) + target, mode="clip") * np.where(
+                escaped, np.float32(1), per_area
+            )
             density[target < 0] = 0
             at = self.pattern.take(texel) * np.int32(self.n_cosine) + number
             cosine = np.maximum(self.cosine_table.directions[2].reshape(-1).take(at), np.float32(1e-6))
@@ -177,8 +181,8 @@ class GatherRays:
     def aimed_segments(self, texel: Int32, number: Int32) -> tuple[NDArray[np.int64], Int32, Float32, Float32]:
         """((r,) row of the aims, (r,) start point, (r, 3) origin, (r, 3) way to the aim) of aimed samples."""
         assert self.bright_table is not None and self.aims is not None
-        at = self.pattern.take(texel).astype(np.int64) * self.n_bright + number
-        start = self.bright_table.start.reshape(-1).take(at)
+        at = self.aim_pattern.take(texel).astype(np.int64) * self.n_bright + number
+        start = self.bright_table.start.reshape(-1).take(self.pattern.take(texel) * np.int32(self.n_bright) + number)
         origins = self._starts(texel, start)
         ways = self.aims.point.take(at, axis=0)
         if self._sky is None:
@@ -205,9 +209,13 @@ class GatherRays:
         weight = np.where(seen, p_c / np.maximum(n_c * p_c + n_b * density, np.finfo(np.float32).tiny), 0)
         rows = np.nonzero(seen)[0]
         ends = np.where(is_sky, np.float32(np.inf), np.float32(1))[rows]
-        hidden = self._tracer.occluded(origins[rows], ways[rows], ends)
-        weight[rows[hidden]] = 0
-        return AimedRays(start, self.aims.target.take(at), weight.astype(np.float32), len(rows))
+        blocked = self._tracer.blocked(origins[rows], ways[rows], ends)
+        weight[rows[blocked != FREE]] = 0
+        target = self.aims.target.take(at)
+        lost = ~seen
+        lost[rows[blocked == WALL]] = True
+        target[lost] = NO_TARGET
+        return AimedRays(start, target, weight.astype(np.float32), len(rows))
 
     def beyond(self, texel: Int32, number: Int32, fan: CosineRays) -> Beyond:
         """Where those of the ``fan``'s rays go on that met surfaces which pass them."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..parallel import Workers
 from ..placed import PlacedScene
@@ -20,7 +21,7 @@ from . import radiosity
 from .bright import BrightTargets
 from .gather import GatherRays
 from .link_store import LinkStore
-from .links import Links
+from .links import Links, make_links
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,21 @@ class Light:
     iim: Float32  # (n, 3) W/m²
     half: Float32  # (n, 3) W/m², the IIM as half of the rays tell it
     stand_in: Int32  # (n,) see Links
+    component: Int32  # (s,) surfaces with another number exchange no light
     updated: Bool  # (n,) texels whose light was computed anew
+
+
+@dataclass(frozen=True)
+class _Inputs:
+    """All that a frame's light hangs on."""
+
+    links: Links
+    component: Int32  # (s,)
+    outside: Float32  # (n, 3) irradiance that does not come by links
+    other: Float32  # (n, 3) irradiance that does not come from texels by links
+    albedo: Float32  # (n, 3)
+    emitted: Float32  # (m, 3)
+    photon_aim: Float32 | None  # (n, 3)
 
 
 @dataclass
@@ -40,8 +55,9 @@ class _Kept:
 
     store: LinkStore
     links: Links | None = None
+    renewed: Bool | None = None  # (n,) texels whose links are not those of the last frame
+    inputs: _Inputs | None = None
     light: Light | None = None
-    inputs: tuple[object, ...] = ()  # what the light was made of
 
 
 class Lighting:
@@ -58,12 +74,14 @@ class Lighting:
         self._kept.clear()
 
     def follow(self, placed: PlacedScene, change: Change, stats: FrameStats) -> None:
-        """Mark the links that ``change`` disturbs, once a frame; those that the frame before did not use are dropped."""
+        """Mark the links that ``change`` disturbs, once a frame; those the frame before did not use are dropped."""
         self._kept = {samples: kept for samples, kept in self._kept.items() if samples in self._used}
         self._used = set()
         self._rays = {}
         if not change.rays_hold:
             self._kept.clear()
+        if not change.sweep.any:
+            return
         for samples, kept in self._kept.items():
             stats.links_tested += kept.store.disturb(
                 self._gather_rays(placed, samples), change.sweep, placed.frame.reach
@@ -71,19 +89,24 @@ class Lighting:
 
     def links(self, placed: PlacedScene, samples: SampleCounts, stats: FrameStats) -> Links:
         """The links of ``samples`` rays a texel, up to date."""
-        rays = self._gather_rays(placed, samples)
         kept = self._kept.get(samples)
         if kept is None:
             memory = (self._settings.link_memory << 20) - sum(k.store.bytes for k in self._kept.values())
-            kept = self._kept[samples] = _Kept(LinkStore(rays, self._workers, memory=max(memory, 0)))
+            store = LinkStore(self._gather_rays(placed, samples), self._workers, memory=max(memory, 0))
+            kept = self._kept[samples] = _Kept(store)
         self._used.add(samples)
-        work = kept.store.renew(rays, np.nonzero(kept.store.pending)[0].astype(np.int32))
+        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
+        pending = np.nonzero(kept.store.pending)[0].astype(np.int32)
+        if kept.links is not None and not len(pending):
+            kept.renewed = np.zeros(kept.store.count, np.bool_)
+            stats.links_kept += kept.store.target.size
+            return kept.links
+        rays = self._gather_rays(placed, samples)
+        work = kept.store.renew(rays, pending)
         stats.rays += work.traced
         stats.links_traced += work.renewed
         stats.links_kept += work.kept
-        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
-        if kept.links is None or work.changed.any():
-            kept.links = Links(kept.store, rays, self._workers)
+        kept.links, kept.renewed = make_links(kept.store, rays, self._workers), work.changed
         return kept.links
 
     def light(
@@ -94,16 +117,41 @@ class Lighting:
         ``aim`` (n, 3): all light as photons tell it; without it the AIM is radiosity's fixed point.
         """
         kept = self._kept[samples]
-        inputs = (links, outside, placed.albedo, placed.emitted, aim)
-        if kept.light is not None and all(_same(a, b) for a, b in zip(inputs, kept.inputs, strict=True)):
-            kept.light = replace(kept.light, updated=np.zeros(placed.texels.count, np.bool_))
-            return kept.light
-        if aim is None:
-            aim = radiosity.solve(links, outside, placed.albedo, placed.emitted)
-        iim, half = links.with_half(radiosity.sent_by_targets(aim, placed.albedo, placed.emitted))
-        kept.inputs = inputs
-        kept.light = Light(aim, iim, half, links.stand_in, np.ones(placed.texels.count, np.bool_))
+        component, coupled = kept.store.components()
+        other = self._with_emitted(kept, links, placed.emitted, outside)
+        now = _Inputs(links, component, outside, other, placed.albedo, placed.emitted, aim)
+        surface = placed.texels.surface
+        stale = np.ones(placed.texels.count, np.bool_)
+        if kept.inputs is not None and kept.renewed is not None:
+            stale = _stale(kept.inputs, now, kept.renewed, surface)
+        light = self._solved(now, kept.light, np.nonzero(stale)[0], np.where(coupled, component, -1)[surface])
+        kept.inputs, kept.light = now, replace(light, updated=stale)
         return kept.light
+
+    def _with_emitted(self, kept: _Kept, links: Links, emitted: Float32, outside: Float32) -> Float32:
+        """(n, 3) all irradiance but what texels send back; the array of the last frame where nothing differs."""
+        before = kept.inputs
+        if before is not None and before.links is links and before.emitted is emitted and before.outside is outside:
+            return before.other
+        return outside + links.irradiance(emitted) if emitted.any() else outside
+
+    def _solved(self, now: _Inputs, before: Light | None, texels: NDArray[np.int64], group: Int32) -> Light:
+        """The light of ``texels`` (r,) anew, all else as ``before``."""
+        if before is None:
+            none = np.zeros_like(now.other)
+            before = Light(none, none, none, now.links.stand_in, now.component, np.zeros(len(none), np.bool_))
+        if not len(texels):
+            return before
+        links = now.links if len(texels) == len(now.other) else now.links.only(texels)
+        aim, iim, half = before.aim.copy(), before.iim.copy(), before.half.copy()
+        if now.photon_aim is None:
+            aim[texels] = radiosity.solve(
+                links, texels, group[texels], now.other[texels], now.albedo[texels], len(now.emitted)
+            )
+        else:
+            aim[texels] = now.photon_aim[texels]
+        iim[texels], half[texels] = links.with_half(radiosity.sent_by_targets(aim, now.albedo, now.emitted))
+        return replace(before, aim=aim, iim=iim, half=half, stand_in=now.links.stand_in, component=now.component)
 
     def _gather_rays(self, placed: PlacedScene, samples: SampleCounts) -> GatherRays:
         if samples not in self._rays:
@@ -114,6 +162,27 @@ class Lighting:
         return self._rays[samples]
 
 
-def _same(a: object, b: object) -> bool:
-    """One and the same, or arrays of the same bits."""
-    return a is b or (isinstance(a, np.ndarray) and isinstance(b, np.ndarray) and np.array_equal(a, b))
+def _stale(before: _Inputs, now: _Inputs, renewed: Bool, surface: Int32) -> Bool:
+    """(n,) texels of components in which anything differs; renewed (n,): links do."""
+    differ = renewed | (before.links.stand_in != now.links.stand_in)
+    pairs = ((before.other, now.other), (before.albedo, now.albedo), (before.photon_aim, now.photon_aim))
+    for old, new in pairs:
+        if old is not new:
+            differ |= True if old is None or new is None else np.any(old != new, axis=1)
+    if before.emitted is not now.emitted:
+        sent = np.any(before.emitted != now.emitted, axis=1)
+        differ |= sent[: len(differ)]
+    count = len(now.component)
+    touched = np.bincount(surface[differ], minlength=count) > 0
+    touched |= _regrouped(before.component, now.component)
+    stale = np.bincount(now.component[touched], minlength=count) > 0
+    return np.asarray(stale[now.component][surface])
+
+
+def _regrouped(before: Int32, now: Int32) -> Bool:
+    """(s,) surfaces whose component has lost or won some."""
+    if np.array_equal(before, now):
+        return np.zeros(len(now), np.bool_)
+    lowest = [np.unique(labels, return_index=True)[1][labels] for labels in (before, now)]
+    other = lowest[0] != lowest[1]
+    return np.asarray(np.isin(before, before[other]) | np.isin(now, now[other]))

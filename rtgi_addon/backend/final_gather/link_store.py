@@ -17,6 +17,7 @@ from ..parallel import CHUNK_RAYS, Workers
 from ..scene import Bool, Float32, Float64, Int32
 from ..selection.sweep import Sweep
 from .beyond_store import BeyondStore
+from .components import SurfaceGraph
 from .gather import NO_TARGET, GatherRays, TracedTexels
 from .touched import touched_rays
 
@@ -58,13 +59,28 @@ class LinkStore:
         self._cut: Bool = np.zeros(count, np.bool_)
         self._pending = np.ones((self.kept, slots), np.bool_)
         self._pending_texel = np.ones(count, np.bool_)
+        self._filled = False  # is anything traced yet?
         self.beyond = BeyondStore(rays.n_cosine)
+        self.graph = SurfaceGraph(rays.texels.surface_count)
+        self._surface = rays.texels.surface
+        self._surface_of_column = np.full(self.nothing + 1, -1, np.int32)
+        self._surface_of_column[:count] = rays.texels.surface
         self._cosine_slots, self._aimed_slots = _slots(rays.n_cosine, rays.n_bright)
 
     @property
     def bytes(self) -> int:
         """Memory that the kept links take."""
         return self.target.nbytes + self.weight.nbytes + self._distance.nbytes + self._pending.nbytes
+
+    def components(self) -> tuple[Int32, Bool]:
+        """((s,) which surfaces exchange light, numbered; (s,) whether they exchange any).
+
+        Links that are not kept, and those beyond mirrors and glass, are not followed: all surfaces are then one.
+        """
+        if self.kept < self.count or self.beyond.all.rays:
+            count = self.graph.surface_count
+            return np.zeros(count, np.int32), np.ones(count, np.bool_)
+        return self.graph.labels(), self.graph.coupled()
 
     @property
     def pending(self) -> Bool:
@@ -85,7 +101,8 @@ class LinkStore:
 
         def part(rows: slice) -> int:
             of = texel[rows]
-            found = touched_rays(rays, sweep, of, self._distance[of], reach)
+            open_aims = self.target[of][:, self._aimed_slots] != self.nothing
+            found = touched_rays(rays, sweep, of, self._distance[of], open_aims, reach)
             mark = np.zeros((len(of), self.target.shape[1]), np.bool_)
             mark[:, self._cosine_slots], mark[:, self._aimed_slots] = found.cosine, found.aimed
             self._pending[of] |= mark
@@ -133,6 +150,9 @@ class LinkStore:
         if not len(texel):
             return texel
         pending = self._pending[texel]
+        at = np.nonzero(pending)
+        links = texel[at[0]], at[1]
+        self.graph.remove(*self._pairs(*links))
         row, number = np.nonzero(pending[:, self._cosine_slots])
         of, number = texel[row], number.astype(np.int32)
         beyond = []
@@ -154,7 +174,8 @@ class LinkStore:
         self.beyond.replace_rays(of, number, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
         if self._bright:
             work.traced += self._renew_aimed(rays, texel, pending)
-        self._sum(texel)
+        self.graph.add(*self._pairs(*links))
+        self.total[texel] = _totals(self.weight[texel])
         return np.asarray(np.unique(np.concatenate([np.zeros(0, np.int32), *(d[1] for d in done)])))
 
     def _renew_aimed(self, rays: GatherRays, texel: Int32, pending: Bool) -> int:
@@ -165,7 +186,7 @@ class LinkStore:
             t, k = of[rows], number[rows]
             found = rays.aimed(t, k)
             slot = self._aimed_slots[k]
-            self.target[t, slot], self.weight[t, slot] = found.target, found.weight
+            self.target[t, slot], self.weight[t, slot] = self._column(found.target), found.weight
             return found.cast
 
         return sum(self._workers.map_slices(aimed, len(of)))
@@ -175,6 +196,9 @@ class LinkStore:
         if not len(texel):
             return
         beyond = []
+        kept = texel[texel < self.kept]
+        if self._filled:
+            self.graph.remove(*self._pairs(kept))
 
         def part(rows: slice) -> int:
             of = texel[rows]
@@ -194,7 +218,9 @@ class LinkStore:
             return traced.rays
 
         work.traced += sum(self._workers.map_slices(part, len(texel), self.chunk))
-        work.renewed += int(np.count_nonzero(texel < self.kept)) * self.target.shape[1]
+        work.renewed += len(kept) * self.target.shape[1]
+        self.graph.add(*self._pairs(kept))
+        self._filled = True
         self.beyond.replace_texels(texel, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
 
     def rows(self, traced: TracedTexels) -> tuple[Int32, Float32]:
@@ -211,8 +237,12 @@ class LinkStore:
     def _column(self, target: Int32) -> Int32:
         return np.where(target == NO_TARGET, np.int32(self.nothing), target)
 
-    def _sum(self, texel: Int32) -> None:
-        self.total[texel] = _totals(self.weight[texel])
+    def _pairs(self, texel: Int32, slot: NDArray[np.int64] | None = None) -> tuple[Int32, Int32]:
+        """Surfaces that links lead from and to, for the graph; all links of ``texel`` (m,), or each one's ``slot``."""
+        row = self._surface[texel] if slot is not None else self._surface[texel][:, None]
+        at = texel if slot is None else (texel, slot)
+        target = self._surface_of_column.take(self.target[at])
+        return row, np.where(self.weight[at] > 0, target, np.int32(-1))
 
 
 def _totals(weight: Float32) -> Float64:

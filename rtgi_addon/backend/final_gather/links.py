@@ -8,9 +8,11 @@ in the sum).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 
 from ..parallel import Workers
@@ -19,85 +21,79 @@ from ..surface.texels import stand_ins
 from .beyond_store import beyond_matrices
 from .gather import GatherRays
 from .link_store import LinkStore
+from .products import row_products
 
 #: A half's rows are scaled up from the whole's by this at most; 2 is expected.
 MOST_HALF_SCALE = 4.0
-#: Texels of one sparse product: so that threads share them and what they read stays in a core's cache.
-BLOCK_TEXELS = 2048
 
 
 @dataclass(frozen=True)
 class _Gathered:
-    """What m texels get: before rows are scaled."""
+    """What r texels get, before rows are scaled."""
 
-    halves: Float32  # (m, 2, 3) by each half of the rays
-    beyond: Float32  # (m, 3) by way of mirrors and glass
+    halves: Float32  # (r, 2, c) by each half of the rays
+    beyond: Float32  # (r, c) by way of mirrors and glass
 
 
+@dataclass(frozen=True)
 class Links:
-    """n texels' links to m targets (texels first, then sky patches) in one frame.
+    """Links of r texels to m targets (texels first, then sky patches) in one frame.
 
-    ``stand_in`` (n,): the texel whose light stands for each; itself unless it lies under other geometry; -1: none.
     A target that is not valid has no light of its own, though a sliver of it may be in sight: it is seen as what stands
     for it. Where nothing does, the link counts for nothing and the rest of its row makes up for it.
     """
 
-    def __init__(self, store: LinkStore, rays: GatherRays, workers: Workers) -> None:
-        self._store, self._rays, self._workers = store, rays, workers
-        self.stand_in = stand_ins(rays.texels, store.valid)
-        self._blocks = [
-            _as_matrix(store.weight[a : a + BLOCK_TEXELS], store.target[a : a + BLOCK_TEXELS], store.nothing + 1)
-            for a in range(0, store.kept, BLOCK_TEXELS)
-        ]
-        self._beyond = store.beyond.matrices(store.kept, store.nothing + 1)
-        nothing = np.int32(store.nothing)
-        others = np.arange(store.count, store.nothing + 1, dtype=np.int32)
-        self._seen_as = np.concatenate([np.where(self.stand_in < 0, nothing, self.stand_in), others])
-        whole, half = self._weights()
-        self._scale = _inverse(whole)
-        # Half of few rays may have hardly any weight; its own scale would then give nearly all to one bright target.
-        self._half_scale = np.minimum(_inverse(half), self._scale * np.float32(MOST_HALF_SCALE))
+    stand_in: Int32  # (n,) of all texels: whose light stands for each; itself unless under other geometry; -1: none
+    _store: LinkStore
+    _rays: GatherRays
+    _workers: Workers
+    _seen_as: Int32  # (m + 1,) what each target, and nothing, is seen as
+    _product: Callable[[Float32], Float32]  # (m + 1, c) to (2 r, c), halves of the kept texels
+    _beyond: tuple[sparse.csr_matrix, ...]  # three (r, m + 1), one a channel; () where there are none
+    _all: bool  # r = n
+    _scale: Float32  # (r, 1)
+    _half_scale: Float32  # (r, 1)
 
     def irradiance(self, radiosity: Float32) -> Float32:
-        """(n, 3) W/m² from the radiosity (m, 3) of all targets."""
+        """(r, 3) W/m² from the radiosity (m, 3) of all targets."""
         got = self._gather(self._seen(radiosity))
-        return np.asarray((got.halves[:, 0] + got.halves[:, 1] + got.beyond) * self._scale[:, None])
+        return np.asarray((got.halves[:, 0] + got.halves[:, 1] + got.beyond) * self._scale)
 
     def with_half(self, radiosity: Float32) -> tuple[Float32, Float32]:
         """:meth:`irradiance`, and the same as half of the rays estimate it."""
         got = self._gather(self._seen(radiosity))
-        whole = (got.halves[:, 0] + got.halves[:, 1] + got.beyond) * self._scale[:, None]
+        whole = np.asarray((got.halves[:, 0] + got.halves[:, 1] + got.beyond) * self._scale)
         # The half shares the rays beyond: their noise is not in its difference from the whole.
-        return whole, got.halves[:, 0] * self._half_scale[:, None] + got.beyond * self._scale[:, None]
+        return whole, got.halves[:, 0] * self._half_scale + got.beyond * self._scale
+
+    def only(self, texels: NDArray[np.int64]) -> Links:
+        """The links of ``texels`` (r,), of the links of all."""
+        if self._store.kept < self._store.count:
+            raise ValueError("links that are not kept cannot be taken apart")
+        return replace(
+            self,
+            _product=_halves(self._store, texels, self._workers),
+            _beyond=tuple(matrix[texels] for matrix in self._beyond),
+            _scale=self._scale[texels],
+            _half_scale=self._half_scale[texels],
+            _all=False,
+        )
 
     def _seen(self, radiosity: Float32) -> Float32:
-        """(m + 1, 3) what each column shows: nothing is black."""
+        """(m + 1, c) what each column shows: nothing is black."""
         dark = np.zeros((1, radiosity.shape[1]), np.float32)
         return np.asarray(np.concatenate([radiosity, dark]).take(self._seen_as, axis=0))
 
-    def _weights(self) -> tuple[Float64, Float64]:
-        """((n,), (n,)) weight of each row's links, and of the half's, without those to what nothing stands for."""
-        total = self._store.total
-        lost = np.zeros((self._store.nothing + 1, 1), np.float32)
-        lost[: self._store.count, 0] = self.stand_in < 0
-        if lost.any():
-            total = np.maximum(total - self._gather(lost).halves[:, :, 0], 0)
-            # What rounding leaves of a row that saw nothing else is not a weight.
-            total[total < 1e-6 * self._store.total] = 0
-        return total[:, 0] + total[:, 1], total[:, 0]
-
     def _gather(self, seen: Float32) -> _Gathered:
-        """Of all texels; ``seen`` (m + 1, c)."""
-        parts = self._workers.map_slices(lambda s: _product(self._blocks[s.start], seen), len(self._blocks), 1)
-        kept, width = self._store.kept, seen.shape[1]
-        halves = np.concatenate([np.zeros((0, 2, width), np.float32), *parts])
-        beyond = np.zeros((kept, width), np.float32)
-        for channel, matrix in enumerate(self._beyond if width == 3 else ()):
-            beyond[:, channel] = matrix @ seen[:, channel]
-        if kept == self._store.count:
+        store, width = self._store, seen.shape[1]
+        halves = np.ascontiguousarray(self._product(seen)).reshape(-1, 2, width)
+        beyond = _through(self._beyond, seen, len(halves))
+        if not self._all or store.kept == store.count:
             return _Gathered(halves, beyond)
         others = self._workers.map_slices(
-            lambda s: self._traced(kept + s.start, kept + s.stop, seen), self._store.count - kept, self._store.chunk
+            lambda s: self._traced(store.kept + s.start, store.kept + s.stop, seen),
+            store.count - store.kept,
+            store.chunk,
         )
         return _Gathered(
             np.concatenate([halves, *(o.halves for o in others)]), np.concatenate([beyond, *(o.beyond for o in others)])
@@ -105,26 +101,62 @@ class Links:
 
     def _traced(self, first: int, stop: int, seen: Float32) -> _Gathered:
         """Of texels whose links are not kept: traced for this product alone."""
-        count, width = stop - first, seen.shape[1]
         traced = self._rays.trace(np.arange(first, stop, dtype=np.int32))
         target, weight = self._store.rows(traced)
-        beyond = np.zeros((count, width), np.float32)
+        one = Workers(1)  # this is one of many threads already
+        halves = row_products(*_as_halves(target, weight), len(seen), one)(seen)
         found = beyond_matrices(traced.beyond, self._rays.n_cosine, first, stop, len(seen))
-        for channel, matrix in enumerate(found if width == 3 else ()):
-            beyond[:, channel] = matrix @ seen[:, channel]
-        return _Gathered(_product(_as_matrix(weight, target, len(seen)), seen), beyond)
+        return _Gathered(
+            np.ascontiguousarray(halves).reshape(-1, 2, seen.shape[1]), _through(found, seen, stop - first)
+        )
 
 
-def _as_matrix(weight: Float32, target: Int32, columns: int) -> sparse.csr_matrix:
-    """(2 m, columns) of weight, target (m, K): two rows a texel, its halves. Nothing is copied."""
-    count, slots = weight.shape
-    starts = np.arange(0, weight.size + 1, slots // 2, dtype=np.int32)
-    return sparse.csr_matrix((weight.reshape(-1), target.reshape(-1), starts), shape=(2 * count, columns))
+def make_links(store: LinkStore, rays: GatherRays, workers: Workers) -> Links:
+    """The links of all texels as they stand in the frame of ``rays``."""
+    stand_in = stand_ins(rays.texels, store.valid)
+    others = np.arange(store.count, store.nothing + 1, dtype=np.int32)
+    links = Links(
+        stand_in=stand_in,
+        _store=store,
+        _rays=rays,
+        _workers=workers,
+        _seen_as=np.concatenate([np.where(stand_in < 0, np.int32(store.nothing), stand_in), others]),
+        _product=_halves(store, None, workers),
+        _beyond=store.beyond.matrices(store.kept, store.nothing + 1),
+        _all=True,
+        _scale=np.zeros((0, 1), np.float32),
+        _half_scale=np.zeros((0, 1), np.float32),
+    )
+    total = store.total
+    lost = np.zeros((store.nothing + 1, 1), np.float32)
+    lost[: store.count, 0] = stand_in < 0
+    if lost.any():
+        total = np.maximum(total - links._gather(lost).halves[:, :, 0], 0)
+        # What rounding leaves of a row that saw nothing else is not a weight.
+        total[total < 1e-6 * store.total] = 0
+    scale = _inverse(total[:, 0] + total[:, 1])
+    # Half of few rays may have hardly any weight; its own scale would then give nearly all to one bright target.
+    half_scale = np.minimum(_inverse(total[:, 0]), scale * np.float32(MOST_HALF_SCALE))
+    return replace(links, _scale=scale[:, None], _half_scale=half_scale[:, None])
 
 
-def _product(matrix: sparse.csr_matrix, seen: Float32) -> Float32:
-    """(m, 2, c)"""
-    return np.asarray(matrix @ seen, np.float32).reshape(-1, 2, seen.shape[1])
+def _halves(store: LinkStore, texels: NDArray[np.int64] | None, workers: Workers) -> Callable[[Float32], Float32]:
+    """Products of the kept links of ``texels`` (default: all), two rows a texel."""
+    chosen = slice(None) if texels is None else texels
+    return row_products(*_as_halves(store.target[chosen], store.weight[chosen]), store.nothing + 1, workers)
+
+
+def _as_halves(target: Int32, weight: Float32) -> tuple[Int32, Float32]:
+    half = target.shape[1] // 2
+    return target.reshape(-1, half), weight.reshape(-1, half)
+
+
+def _through(matrices: tuple[sparse.csr_matrix, ...], seen: Float32, count: int) -> Float32:
+    """(count, c) what arrives through mirrors and glass; of c = 3 channels, each by its own matrix."""
+    out = np.zeros((count, seen.shape[1]), np.float32)
+    for channel, matrix in enumerate(matrices if seen.shape[1] == 3 else ()):
+        out[:, channel] = matrix @ seen[:, channel]
+    return out
 
 
 def _inverse(weight: Float64) -> Float32:

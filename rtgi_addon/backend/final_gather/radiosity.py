@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The AIM by feedback: all light at every texel, from the links alone, without photon noise.
 
-What arrives at the texels is x = D + G (ρ x + m), with D what comes by other ways (lamps, caustics), G the links,
-ρ albedo and m emitted radiosity. That linear system is radiosity's; it is solved, not iterated bounce by bounce, so
-that rooms of albedo 0.98 need a dozen products instead of hundreds.
+What arrives at the texels is x = D + G (ρ x + m): D by other ways (lamps, caustics), G the links, ρ albedo, m emitted
+radiosity. That linear system is radiosity's; it is solved, not iterated bounce by bounce, so that rooms of albedo 0.98
+need a dozen products instead of hundreds. Surfaces that exchange no light are solved apart, and again only where
+something differs.
 """
 
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..scene import Float32
+from ..scene import Float32, Int32
 from .links import Links
 from .solvers import solve_fixed_point
 
@@ -19,18 +21,19 @@ TOLERANCE = 1e-4
 MOST_PRODUCTS = 200
 
 
-def solve(links: Links, outside: Float32, albedo: Float32, emitted: Float32) -> Float32:
-    """(n, 3) the AIM at radiosity's fixed point.
+def solve(links: Links, texels: NDArray[np.int64], group: Int32, b: Float32, albedo: Float32, targets: int) -> Float32:
+    """(r, 3) the AIM of ``texels`` (r,) at radiosity's fixed point.
 
-    outside (n, 3): irradiance that does not come by links · albedo (n, 3) · emitted (m, 3): radiosity that targets
-    send of themselves, W/m² (texels: π Le; sky patches: π L).
+    links of those texels to all ``targets`` · group (r,): texels that exchange light have one number, those that
+    exchange none -1; no group may be cut · b (r, 3): irradiance by other ways than from texels · albedo (r, 3).
     """
-    b = outside + links.irradiance(emitted) if emitted.any() else outside
+    radiosity = np.zeros((targets, 3), np.float32)
 
     def bounce(x: Float32) -> Float32:
-        return links.irradiance(_padded(albedo * x, len(emitted)))
+        radiosity[texels] = albedo * x
+        return links.irradiance(radiosity)
 
-    solution = solve_fixed_point(bounce, b, tolerance=TOLERANCE, max_products=MOST_PRODUCTS)
+    solution = solve_fixed_point(bounce, b, group=group, tolerance=TOLERANCE, max_products=MOST_PRODUCTS)
     return np.maximum(solution.x, 0).astype(np.float32)
 
 
@@ -39,11 +42,3 @@ def sent_by_targets(irradiance: Float32, albedo: Float32, emitted: Float32) -> F
     radiosity = emitted.copy()
     radiosity[: len(irradiance)] += albedo * irradiance
     return radiosity
-
-
-def _padded(values: Float32, rows: int) -> Float32:
-    if len(values) == rows:
-        return values
-    out = np.zeros((rows, values.shape[1]), np.float32)
-    out[: len(values)] = values
-    return out

@@ -27,11 +27,14 @@ class Touched:
     tested: int  # rays that were looked at one by one
 
 
-def touched_rays(rays: GatherRays, sweep: Sweep, texel: Int32, distance: Float32, reach: Float32) -> Touched:
-    """The rays of ``texel`` (m,), which did not move; distance (m, cosine) of their hits, reach (n,) of all texels'
-    points from their middle.
+def touched_rays(
+    rays: GatherRays, sweep: Sweep, texel: Int32, distance: Float32, open_aims: Bool, reach: Float32
+) -> Touched:
+    """The rays of ``texel`` (m,), which did not move.
 
-    Aimed samples whose target moved count as touched, whether they meet it or not.
+    distance (m, cosine) of their hits · open_aims (m, bright) False: nothing that moves can uncover the aim · reach
+    (n,) of all texels' points from their middle. Aimed samples whose target moved count as touched, whether they meet
+    it or not.
     """
     cosine = np.zeros((len(texel), rays.n_cosine), np.bool_)
     aimed = np.zeros((len(texel), rays.n_bright), np.bool_)
@@ -49,7 +52,7 @@ def touched_rays(rays: GatherRays, sweep: Sweep, texel: Int32, distance: Float32
             cosine[row[met], number[met]] = True
         if rays.aims is None:
             continue
-        row, number = np.nonzero(_aimed_near(rays, view, texel) & ~aimed)
+        row, number = np.nonzero(_aimed_near(rays, view, texel) & open_aims & ~aimed)
         tested += len(row)
         if len(row):
             at, _, origins, ways = rays.aimed_segments(texel[row], number.astype(np.int32))
@@ -99,7 +102,7 @@ def _aimed_near(rays: GatherRays, view: _View, texel: Int32) -> Bool:
     assert rays.aims is not None
     near = np.zeros((len(texel), rays.n_bright), np.bool_)
     of = texel[view.row]
-    pattern = rays.pattern.take(of)
+    pattern = rays.aim_pattern.take(of)
     shape = (-1, rays.n_bright)
     is_sky = rays.aims.is_sky.reshape(shape).take(pattern, axis=0)
     from_here = ~is_sky
@@ -123,4 +126,4 @@ def _aimed_at_moved(rays: GatherRays, sweep: Sweep, texel: Int32) -> Bool:
     instance = rays.texels.instance
     moved = ~rays.aims.is_sky
     moved[moved] = sweep.moved[instance[rays.aims.target[moved]]]
-    return np.asarray(moved.reshape(-1, rays.n_bright).take(rays.pattern.take(texel), axis=0))
+    return np.asarray(moved.reshape(-1, rays.n_bright).take(rays.aim_pattern.take(texel), axis=0))

@@ -25,8 +25,8 @@ class Geometry:
     origin (3,) float64 world · extent: diagonal of the first frame's bounds, m · corners (t, 3, 3) float32 local ·
     normals (t, 3) unit geometric normals, zero for degenerate triangles · areas (t,) m² · corner_normals (t, 3, 3)
     unit shading normals · instance_of_triangle, material_of_triangle (t,) · first_triangle (n + 1,) · mirrored (n,)
-    bool: the transform is a reflection. Normals point to the side that the object's own front faces, mirrored or not, as
-    in Blender.
+    bool: the transform is a reflection. Normals point to the side that the object's own front faces, mirrored or not,
+    as in Blender.
     """
 
     def __init__(self, scene: Scene, state: FrameState) -> None:

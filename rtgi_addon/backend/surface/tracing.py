@@ -21,6 +21,10 @@ from ..parallel import Workers
 from ..scene import Bool, Float32, Float64, FrameState, Int32, Scene
 from .geometry import Geometry
 
+UInt8 = NDArray[np.uint8]
+
+FREE, MOVER, WALL = np.uint8(0), np.uint8(1), np.uint8(2)
+
 
 @dataclass(frozen=True)
 class Hits:
@@ -51,6 +55,10 @@ class Tracer(Protocol):
 
     def occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
         """(n,) is anything hit before ``distances`` (in units of the direction's length)?"""
+        ...
+
+    def blocked(self, origins: Float32, directions: Float32, distances: Float32) -> UInt8:
+        """(n,) FREE, or what is hit before ``distances``: a MOVER, or a WALL, which stays put whatever moves."""
         ...
 
 
@@ -147,10 +155,13 @@ class EmbreeTracer:
         )
 
     def occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
+        return np.asarray(self.blocked(origins, directions, distances) != FREE)
+
+    def blocked(self, origins: Float32, directions: Float32, distances: Float32) -> UInt8:
         chunks = self._workers.map_slices(
-            lambda s: self._occluded(origins[s], directions[s], distances[s]), len(origins)
+            lambda s: self._blocked(origins[s], directions[s], distances[s]), len(origins)
         )
-        return np.concatenate(chunks) if chunks else np.zeros(0, np.bool_)
+        return np.concatenate(chunks) if chunks else np.zeros(0, np.uint8)
 
     def _moves(self, index: int) -> bool:
         instance = self._scene.instances[index]
@@ -210,10 +221,16 @@ class EmbreeTracer:
         normals = self._geometry.normals.take(triangle, axis=0, mode="clip")
         return Hits(triangle, u, v, distance, np.einsum("ij,ij->i", normals, directions))
 
-    def _occluded(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
-        blocked = np.zeros(len(origins), np.bool_)
-        for part in self._parts():
-            blocked |= part.occluded(origins, directions, distances)
+    def _blocked(self, origins: Float32, directions: Float32, distances: Float32) -> UInt8:
+        blocked = np.zeros(len(origins), np.uint8)
+        if self._still is not None:
+            blocked[self._still.occluded(origins, directions, distances)] = WALL
+        left = np.nonzero(blocked == FREE)[0] if self._movers else np.zeros(0, np.int64)
+        for place in self._movers.values():
+            if len(left):
+                met = place.part.occluded(origins[left], directions[left], distances[left])
+                blocked[left[met]] = MOVER
+                left = left[~met]
         return blocked
 
     def _parts(self) -> list[Part]:
