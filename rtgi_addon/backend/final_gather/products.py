@@ -30,8 +30,8 @@ def row_products(target: Int32, weight: Float32, target_count: int, workers: Wor
         raise ValueError(f"target {target.shape} and weight {weight.shape} must be the same (n, K)")
     if target.dtype != np.int32 or weight.dtype != np.float32:
         raise ValueError(f"target {target.dtype} must be int32, weight {weight.dtype} float32")
-    # SciPy does not look: a number outside would read foreign memory.
-    if target.size and not (target.min() >= 0 and target.max() < target_count):
+    # SciPy does not look: a number outside would read foreign memory. Negative ones are large without a sign.
+    if target.size and target.view(np.uint32).max() >= target_count:
         raise ValueError(f"targets {target.min()} .. {target.max()} are not all within 0 .. {target_count - 1}")
     count, width = target.shape
     per_thread = -(-count // workers.count)
