@@ -117,8 +117,8 @@ class PathPool:
         (k,) is the path the same? And of hits_of(rows), and of the hits of ``fresh``: is the hit there in both?
         """
         length, fresh_length = self._length[rows], np.diff(fresh.first_hit)
-        same: Bool = equal_bits(factor, self.factor[rows])
-        common = np.where(same, np.minimum(length, fresh_length), 0)
+        same: Bool = equal_bits(factor, self.factor[rows]) & equal_bits(self._of_path["origin"][rows], fresh.origin)
+        common = np.where(same, np.minimum(length, fresh_length), 0)  # else no hit is the same
         for name in PATH_FIELDS:
             same &= equal_bits(self._of_path[name].take(rows, axis=0), getattr(fresh, name))
         path = np.repeat(np.arange(len(rows)), common)

@@ -12,6 +12,8 @@ from ..lamps.emission import PhotonSource
 from ..placed import PlacedScene
 from ..scene import Bool, Float32
 from ..selection.changes import Change
+from ..selection.schedule import UpdateSchedule
+from ..settings import LiveSettings
 from ..stats import FrameStats
 from .paths import PhotonPaths
 from .photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits, make_photon_map, photon_irradiance
@@ -36,10 +38,11 @@ _CHOOSE: dict[Hits, Callable[[PhotonPaths], Bool]] = {
 class PhotonLight:
     """A store of photons and the maps made from it. A map's bits do not depend on when its surfaces were computed."""
 
-    def __init__(self, store: PhotonStore, *, nearest: int) -> None:
-        """Maps look for the ``nearest`` photons of each texel."""
+    def __init__(self, store: PhotonStore, *, nearest: int, live: LiveSettings | None = None) -> None:
+        """Maps look for the ``nearest`` photons of each texel. ``live``: frames after the first have a budget."""
         self.store = store
-        self._nearest = nearest
+        self._nearest, self._live = nearest, live
+        self._schedules: dict[Hits, UpdateSchedule] = {}
         self._maps: dict[Hits, Float32] = {}
         self._stale: dict[Hits, Bool] = {}
 
@@ -50,8 +53,6 @@ class PhotonLight:
         sources: Sequence[PhotonSource],
         counts: dict[int, int],
         stats: FrameStats,
-        *,
-        budget: int | None = None,
     ) -> PhotonUpdate:
         """Bring the photons to the frame that ``placed`` stands in; see :meth:`PhotonStore.update`.
 
@@ -60,10 +61,14 @@ class PhotonLight:
         update = self.store.update(
             sources, counts, surfaces=placed.surfaces, tracer=placed.tracer, workers=placed.workers,
             sweep=change.sweep, instance_of_triangle=placed.geometry.instance_of_triangle,
-            rebuilt=change.everything, budget=budget,
+            rebuilt=change.everything,
+            budget=self._live.photons if self._live is not None and self._maps else None,
         )  # fmt: skip
         for hits, stale in self._stale.items():
-            stale |= (update.delta_aim if hits is Hits.BOUNCED else update.delta_f) > 0
+            delta = update.delta_aim if hits is Hits.BOUNCED else update.delta_f
+            stale |= delta > 0
+            if hits in self._schedules:
+                self._schedules[hits].add(delta)
             # Photons may lie as before on a surface that slid along under them.
             stale[placed.texels.surface[change.texels]] = True
         stats.rays += update.rays
@@ -80,14 +85,15 @@ class PhotonLight:
             self._stale[hits] = np.ones(placed.texels.surface_count, np.bool_)
         return self._stale[hits].copy()
 
-    def irradiance(self, placed: PlacedScene, hits: Hits, *, surfaces: Bool | None = None) -> Float32:
-        """(n, 3) W/m² from ``hits``. Stale surfaces are computed first; of them only ``surfaces``, if given.
+    def irradiance(self, placed: PlacedScene, hits: Hits) -> Float32:
+        """(n, 3) W/m² from ``hits``. Stale surfaces are computed first; in live frames those that the budget allows.
 
         The same array as before where nothing was computed; an array that was given out is never written to.
         """
+        first = hits not in self._stale
         todo = self.stale(placed, hits)
-        if surfaces is not None:
-            todo &= surfaces
+        if self._live is not None and not first:
+            todo = self._due(placed, hits, todo, self._live)
         if todo.any():
             paths = self.store.paths_on(todo)
             found = make_photon_map(paths, _CHOOSE[hits](paths))
@@ -97,3 +103,21 @@ class PhotonLight:
             self._maps[hits] = np.where(todo[placed.texels.surface][:, None], now, self._maps[hits])
             self._stale[hits] &= ~todo
         return self._maps[hits]
+
+    def _due(self, placed: PlacedScene, hits: Hits, stale: Bool, live: LiveSettings) -> Bool:
+        """(surface_count,) of the ``stale`` surfaces those to compute now, by Δ_f (Larsen04 §3)."""
+        surface = placed.texels.surface
+        area = np.bincount(surface, placed.frame.area, minlength=len(stale))
+        if hits not in self._schedules:
+            self._schedules[hits] = UpdateSchedule(
+                surface, area, threshold=live.threshold, patience=live.patience
+            )  # fmt: skip
+        schedule = self._schedules[hits]
+        schedule.set_area(area)
+        pending = stale[surface]
+        line = schedule.order(pending, float(self._maps[hits].mean(dtype=np.float64)))
+        due = np.zeros(len(stale), np.bool_)
+        due[surface[line[: live.budget.texels]]] = True
+        # A surface is computed whole: its nearest photons are found in a tree of its own.
+        schedule.updated(np.nonzero(due[surface] & pending)[0].astype(np.int32))
+        return due
