@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Speed against error: ``python -m bench`` bakes scenes by several methods and compares them with stored references."""
+"""Speed and error: ``python -m bench`` measures bakes of one frame beside Cycles, animations, and how cost grows.
+
+One module a part: ``run`` (beside Cycles), ``frames`` and ``flicker`` (animations), ``scaling``, ``larsen_tables``.
+"""

@@ -80,22 +80,23 @@ def play(
     """All frames with selection, every so many of them from scratch too, and all of those in ``converged``."""
     off = replace(settings, selection=Selection.OFF)
     compared = set() if converged is None else set(converged.mean)
-    start = time.perf_counter()
     first = sequence.states[0]
-    with open_session(sequence, settings, oidn) as selecting, open_session(sequence, off, oidn) as fresh:
-        results, seconds = [], []
-        scratch_results, scratch_seconds = {}, []
-        selecting.advance(first)
-        first_seconds = time.perf_counter() - start
+    results, seconds = [], []
+    scratch_results, scratch_seconds = {}, []
+    with open_session(sequence, off, oidn) as fresh:
         fresh.advance(first)  # libraries and caches are warm for both
-        for number, state in enumerate(sequence.states[1:], start=1):
-            result, spent = _timed(selecting, state)
-            results.append(result)
-            seconds.append(spent)
-            if number % scratch_every == 1 or number in compared:
-                scratch_results[number], spent = _timed(fresh, state)
-                scratch_seconds.append(spent)
-        texels = selecting.texels
+        start = time.perf_counter()
+        with open_session(sequence, settings, oidn) as selecting:
+            selecting.advance(first)
+            first_seconds = time.perf_counter() - start
+            for number, state in enumerate(sequence.states[1:], start=1):
+                result, spent = _timed(selecting, state)
+                results.append(result)
+                seconds.append(spent)
+                if number % scratch_every == 1 or number in compared:
+                    scratch_results[number], spent = _timed(fresh, state)
+                    scratch_seconds.append(spent)
+        texels = fresh.texels
     pairs = [(values(results[n - 1].maps, texels), values(r.maps, texels)) for n, r in scratch_results.items()]
     selected = _cost(seconds, [r.stats for r in results])
     scratch = _cost(scratch_seconds, [r.stats for r in scratch_results.values()])

@@ -176,8 +176,8 @@ def write_scaling(result: ScalingResult, docs: Path) -> None:
 
 {machine_lines(result.machine)}
 - **Load average** of the machine before the run: {result.machine.load}.
-- Quality draft, but where rays are what grows; medians over {_frame_counts(result)} frames with selection and from
-  scratch.
+- Quality draft, but where rays are what grows. Medians over {_frame_counts(result)} frames, with selection and from
+  scratch. First frame: with selection, from arrays to maps, the session's own set-up included.
 - **Slope:** s of cost ~ x^s, least squares in log-log over the upper half of the range, where what every frame costs
   anyway weighs least.
 
