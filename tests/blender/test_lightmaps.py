@@ -401,6 +401,35 @@ def test_lamps_of_hidden_instancers_keep_shining(picture, add_mesh, tmp_path):
     assert lit[*at, 0] == pytest.approx(unlit[*at, 0] + floor_light, rel=0.01)
 
 
+def test_lamps_of_hidden_instancers_come_and_go_with_them(add_mesh, tmp_path):
+    """One that is hidden for a frame, one that is there at last alone, and a portal, which shows nothing."""
+    scene, chandelier = bpy.context.scene, bpy.data.collections.new("Chandelier")
+    place(add_mesh("Shade", np.array(SQUARE) * 0.1, [(0, 1, 2, 3)], material=white()), 4, 4, chandelier)
+    for name, kind, hidden in (
+        ("Bulb", "POINT", (False, True, False)),
+        ("Late", "POINT", (True, True, False)),
+        ("Portal", "AREA", (False, False, False)),
+    ):
+        lamp = bpy.data.objects.new(name, bpy.data.lights.new(name, kind))
+        lamp.data.cycles.is_portal = name == "Portal"
+        chandelier.objects.link(lamp)
+        for frame, value in enumerate(hidden, start=1):
+            lamp.hide_render = value
+            lamp.keyframe_insert("hide_render", frame=frame)
+    empty = bpy.data.objects.new("Hook", None)
+    empty.instance_type, empty.instance_collection = "COLLECTION", chandelier
+    scene.collection.objects.link(empty)
+    source, _applied = light(tmp_path, (1, 2, 3))
+    assert [lamp.name for lamp in source.lights] == ["Hook/Bulb", "Hook/Late"]
+    shown = {name: [] for name in ("Bulb", "Late")}
+    for frame in (1, 2, 3):
+        scene.frame_set(frame)
+        for name, states in shown.items():
+            states.append(not bpy.data.objects[f"RTGI Hook/{name}"].hide_render)
+    assert shown == {"Bulb": [True, False, True], "Late": [False, False, True]}
+    assert "RTGI Hook/Portal" not in bpy.data.objects
+
+
 def test_missing_maps_are_named_before_anything_is_touched(add_mesh, tmp_path):
     add_mesh("Plain", SQUARE, [(0, 1, 2, 3)], material=white())
     source = extract_source((1,), lambda *_: None)

@@ -106,8 +106,9 @@ def direct_irradiance(
     for number, light in enumerate(lights):
         if not is_dark(light):
             texels = np.nonzero(reached(light, receivers, shadows.geometry.origin))[0].astype(np.int32)
-            strength, traced = lamp_irradiance(light, number, texels, receivers, shadows, workers, seed=seed)
-            total[texels] += irradiance_of(light, strength)
+            strength = np.zeros(len(total), np.float32)
+            strength[texels], traced = lamp_irradiance(light, number, texels, receivers, shadows, workers, seed=seed)
+            total += irradiance_of(light, strength)
             rays += traced
     return total, rays
 
