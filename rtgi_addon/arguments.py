@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, NoReturn, get_type_hints
 
 from .backend.errors import BakeError
-from .backend.settings import BakeSettings
+from .backend.settings import BakeSettings, Selection
 
 #: Blender's own last frame (MAXFRAME).
 LAST_FRAME = 1_048_574
@@ -26,6 +26,7 @@ EXCLUSIVE = {
     "density": "size",
     "quality": "effort",
     "target_error": "effort",
+    "selection": "selection",
 }
 
 _FRAMES = re.compile(r"(-?\d+)(?:-(-?\d+)(?::(-?\d+))?)?")
@@ -80,6 +81,13 @@ def _add_bake(commands: Any) -> None:
             f,
             hints[f.name],
         )
+    groups["selection"].add_argument(
+        "--no-selective",
+        dest="selection",
+        action="store_const",
+        const=Selection.OFF,
+        help="every frame from scratch: --selection off",
+    )
 
 
 def _add_render(commands: Any) -> None:

@@ -22,7 +22,7 @@ from .backend.layout.sides import lit_sides
 from .backend.stats import FrameStats
 from .extract import evaluate_materials, extract_source
 from .extract.source_scene import frame_kept
-from .frames import FrameStates, bake_frames, failing, open_folder, telling_states
+from .frames import FrameStates, bake_frames, failing, guide_of, open_folder, telling_states
 from .job import BakeJob, Plan
 from .layouts import assemble, expected_densities, lay_out, map_sizes
 from .lit_copy import save_lit_copy, take_off
@@ -74,14 +74,15 @@ def bake(job: BakeJob, listener: Listener | None = None) -> BakeSummary:
             scene = assemble(source, layouts, appearance)
             states = FrameStates(source, frames, scene.materials)
         with setup.stage("sides"):
-            front, back = lit_sides(scene, telling_states(states, report))
+            telling = telling_states(states, report)
+            front, back = lit_sides(scene, telling)
         with setup.stage("pack"):
             wanted = {"front": front, "back": back}
             packing = pack(scene, resolution=job.settings.resolution, density=job.settings.density, **wanted)
         said = (*scene_warnings(), *source.warnings, *warnings, *appearance.warnings, *packing.warnings)
         for text in said:
             listener.warn(text)
-        plan = Plan(job, frames, out, scene, packing.atlas, states, setup.seconds, said)
+        plan = Plan(job, frames, out, scene, packing.atlas, states, guide_of(telling), setup.seconds, said)
         folder = open_folder(plan)
         with failing(folder):
             records = bake_frames(plan, folder, listener)

@@ -35,6 +35,8 @@ from .terminal import Listener
 
 #: States of a moving scene that are searched for lit sides; a search takes about a third of a frame's bake.
 SIDES_TESTED = 8
+#: States whose light tells where gather rays are aimed; each takes a frame's direct light.
+GUIDES = 8
 
 
 class FrameStates(Sequence[FrameState]):
@@ -73,6 +75,12 @@ def telling_states(states: Sequence[FrameState], report: Report) -> list[FrameSt
     return told
 
 
+def guide_of(telling: Sequence[FrameState]) -> list[FrameState]:
+    """Of the telling states at most GUIDES, evenly chosen, the first among them: the session lights each once more."""
+    step = max(1, -(-(len(telling) - 1) // max(GUIDES - 1, 1)))
+    return list(telling[::step])
+
+
 def open_folder(plan: Plan) -> BakeFolder:
     """The folder that ``plan`` fills; the first thing that is written."""
     size = {"resolution": plan.atlas.resolution, "pages": plan.atlas.page_count, "kinds": 2}
@@ -104,8 +112,9 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
 
 def _session(plan: Plan, listener: Listener) -> Session:
     return Session(
-        plan.scene, plan.atlas, plan.job.settings, plan.states[0], oidn_paths=library_folders(), report=listener.report
-    )
+        plan.scene, plan.atlas, plan.job.settings, plan.states[0], guide=plan.guide, oidn_paths=library_folders(),
+        report=listener.report,
+    )  # fmt: skip
 
 
 def _once(make: Callable[[], Session]) -> Callable[[], Session]:
@@ -174,7 +183,7 @@ def header(plan: Plan) -> dict[str, Any]:
         "atlas": describe_atlas(plan.scene, plan.atlas),
         "setup_seconds": plan.setup_seconds,
         "warnings": list(plan.warnings),
-        "fingerprint": fingerprint(plan.scene, plan.atlas),
+        "fingerprint": {**fingerprint(plan.scene, plan.atlas), "light over the frames asked for": digest(plan.guide)},
     }
 
 

@@ -34,5 +34,6 @@ class Plan:
     scene: Scene
     atlas: Atlas
     states: Sequence[FrameState]  # of the frames, read from Blender when asked for
+    guide: Sequence[FrameState]  # spread over them; their light tells where gather rays are aimed in all
     setup_seconds: dict[str, float]  # by stage
     warnings: tuple[str, ...]

@@ -32,7 +32,7 @@ from .placed import PlacedScene
 from .progress import Report, silent
 from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
 from .selection.changes import Change
-from .settings import AimBounced, AimDirect, BakeSettings, Caustics, SampleCounts, Selection
+from .settings import AimBounced, AimDirect, BakeSettings, Caustics, LiveSettings, SampleCounts, Selection
 from .stats import FrameStats
 from .surface.geometry import Geometry
 from .surface.texels import Texels
@@ -79,14 +79,15 @@ class Session:
         state: FrameState,
         *,
         guide: Sequence[FrameState] = (),
+        live: LiveSettings | None = None,
         oidn_paths: Sequence[Path] = (),
         report: Report = silent,
     ) -> None:
         """``state`` is the first frame to bake. ``guide``: frames spread over the animation, whose light tells where
-        gather rays are aimed in all of them; default: the first alone. ``oidn_paths``: where Open Image Denoise's
-        library may lie.
+        gather rays are aimed in all of them; default: the first alone. ``live``: frames after the first update no more
+        than its budget allows; without it every frame's maps are converged, and hang on these arguments and the frame's
+        own state, never on which frames were lit before it. ``oidn_paths``: where Open Image Denoise's library may lie.
 
-        A frame's maps hang on these and on its own state, never on which frames were lit before it.
         Raises BakeError when the settings ask for what this machine does not have.
         """
         scene, self._bounded = bounded_scene(scene)
@@ -99,19 +100,19 @@ class Session:
         self._bounds = emission.make_bounds(self._placed.geometry)
         self._sides = sending_sides(scene, atlas)
         self._direct_store = DirectStore()
-        self._photons = self._photon_light(diffuse=True)
-        self._caustic_photons = self._photon_light(diffuse=False)
+        self._photons = self._photon_light(live, diffuse=True)
+        self._caustic_photons = self._photon_light(live, diffuse=False)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
-        self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers)
+        self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers, live)
 
-    def _photon_light(self, *, diffuse: bool) -> PhotonLight:
+    def _photon_light(self, live: LiveSettings | None, *, diffuse: bool) -> PhotonLight:
         most = self.settings.max_bounces if diffuse else self.settings.max_specular + 1
         store = PhotonStore(
             self.texels, selection=self.settings.selection, max_bounces=most, seed=self.settings.seed, diffuse=diffuse
         )
-        return PhotonLight(store, nearest=self.settings.nearest_photons)
+        return PhotonLight(store, nearest=self.settings.nearest_photons, live=live)
 
     @property
     def texels(self) -> Texels:
@@ -195,7 +196,10 @@ class Session:
         with stats.stage("denoise"):
             end, apart = self._finisher, light.component
             iim = end.denoise(light.iim, light.stand_in, component=apart)
-            estimate = noise_estimate(iim, end.denoise(light.half, light.stand_in, component=apart, half=True))
+            estimate = None
+            if self.settings.estimate or self.settings.target_error is not None:
+                half = end.denoise(light.half, light.stand_in, component=apart, half=True)
+                estimate = noise_estimate(iim, half)
         return _Lit(placed.state.frame, samples, light, iim, estimate)
 
     def _count(self, updated: Bool, stats: FrameStats) -> None:

@@ -102,13 +102,17 @@ class BakeSettings:
     aim_bounced: AimBounced = _setting(AimBounced.AUTO, "bounced part of the AIM")
     selection: Selection = _setting(Selection.SWEPT, "how a frame finds what still holds of the one before")
     link_memory: int = _setting(
-        4096, "MiB for gather rays kept, 13 bytes each; what does not fit is traced anew for every bounce", 1, 2**20
+        4096,
+        "MiB for kept gather rays, 11 bytes each; what does not fit is traced anew for every bounce",
+        1,
+        2**20,
     )
     direct_samples: int = _setting(8, "shadow rays per texel and lamp; 8 use each of a texel's points once", 1, 4096)
     photons: int = _setting(100_000, "photons emitted per frame, shared by the lights by their flux", 1, 100_000_000)
     nearest_photons: int = _setting(64, "photons in one irradiance estimate (k)", 4, 1024)
     max_bounces: int = _setting(64, "longest photon path", 1, 1024)
     max_specular: int = _setting(16, "mirrors and glass one ray may pass", 0, 256)
+    estimate: bool = _setting(True, "estimated error of each frame; costs a second denoise")
     denoise: bool = _setting(True, "Open Image Denoise on the IIM")
     seams: bool = _setting(True, "match the borders of islands of one smooth surface")
     threads: int = _setting(0, "threads for tracing; 0: one per core", 0, 1024)
@@ -124,3 +128,34 @@ class BakeSettings:
     def samples(self) -> SampleCounts:
         """Gather rays per texel when no target error is set."""
         return SAMPLES_OF_QUALITY[self.quality]
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What the updates of one live frame may cost. With neither limit everything is done, as in a batch frame."""
+
+    texels: int | None = None
+    milliseconds: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.texels is not None and self.texels < 1:
+            raise ValueError(f"a budget of {self.texels} texels updates nothing")
+        if self.milliseconds is not None and not self.milliseconds >= 0:
+            raise ValueError(f"a budget of {self.milliseconds} ms")
+
+
+@dataclass(frozen=True)
+class LiveSettings:
+    """How a session that must not stop for long follows the scene (Larsen04 §3, §4)."""
+
+    budget: Budget = field(default_factory=Budget)
+    photons: int | None = None  # re-traced in a frame; None: all that are disturbed
+    threshold: float = 1e-3  # a surface waits while its Δ per area is below this share of the mean irradiance
+    patience: int = 30  # but no texel longer than so many frames, and those it then waits in line
+    blend_time: float = 0.2  # seconds over which new maps take the place of those shown
+
+    def __post_init__(self) -> None:
+        if self.photons is not None and self.photons < 1:
+            raise ValueError(f"a budget of {self.photons} photons updates nothing")
+        if not (self.threshold >= 0 and self.patience >= 0 and self.blend_time >= 0):
+            raise ValueError(f"{self}: threshold, patience and blend time must not be negative")

@@ -24,6 +24,7 @@ class FrameStats:
     links_kept: int = 0
     texels_updated: int = 0
     texels_kept: int = 0
+    texels_pending: int = 0  # of live frames: still with links of an earlier one
     surfaces_updated: int = 0
     surfaces_kept: int = 0
     gather: str = "links"

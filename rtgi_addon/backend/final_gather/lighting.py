@@ -6,6 +6,7 @@ Links follow what moves; where neither they nor anything they bring light from d
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,8 +16,10 @@ from ..parallel import Workers
 from ..placed import PlacedScene
 from ..scene import Bool, Float32, Int32
 from ..selection.changes import Change
-from ..settings import BakeSettings, SampleCounts
+from ..selection.schedule import UpdateSchedule, within
+from ..settings import BakeSettings, LiveSettings, SampleCounts
 from ..stats import FrameStats
+from ..surface.texels import surface_areas
 from . import radiosity
 from .bright import BrightTargets
 from .gather import GatherRays
@@ -58,13 +61,18 @@ class _Kept:
     renewed: Bool | None = None  # (n,) texels whose links are not those of the last frame
     inputs: _Inputs | None = None
     light: Light | None = None
+    schedule: UpdateSchedule | None = None  # of live frames
+    waiting: Bool | None = None  # (n,) texels that the last live frame left pending
 
 
 class Lighting:
     """The links of one bake, for each number of rays that its frames ask for."""
 
-    def __init__(self, settings: BakeSettings, bright: BrightTargets, workers: Workers) -> None:
-        self._settings, self._bright, self._workers = settings, bright, workers
+    def __init__(
+        self, settings: BakeSettings, bright: BrightTargets, workers: Workers, live: LiveSettings | None = None
+    ) -> None:
+        """``live``: after the first frame each one brings only some texels' links up to date."""
+        self._settings, self._bright, self._workers, self._live = settings, bright, workers, live
         self._kept: dict[SampleCounts, _Kept] = {}
         self._used: set[SampleCounts] = set()
         self._rays: dict[SampleCounts, GatherRays] = {}  # of this frame
@@ -102,12 +110,42 @@ class Lighting:
             stats.links_kept += kept.store.target.size
             return kept.links
         rays = self._gather_rays(placed, samples)
-        work = kept.store.renew(rays, pending)
-        stats.rays += work.traced
-        stats.links_traced += work.renewed
-        stats.links_kept += work.kept
-        kept.links, kept.renewed = make_links(kept.store, rays, self._workers), work.changed
+        kept.renewed, renewed = np.zeros(kept.store.count, np.bool_), 0
+        for texels in self._line(placed, kept, pending):
+            work = kept.store.renew(rays, texels)
+            kept.renewed |= work.changed
+            renewed += work.renewed
+            stats.rays += work.traced
+        stats.links_traced += renewed
+        stats.links_kept += kept.store.target.size - renewed
+        stats.texels_pending = int(np.count_nonzero(kept.store.pending))
+        kept.links = make_links(kept.store, rays, self._workers)
         return kept.links
+
+    def _line(self, placed: PlacedScene, kept: _Kept, pending: Int32) -> Iterator[Int32]:
+        """The ``pending`` texels to bring up to date now, in parts: all, or what a live frame's budget allows."""
+        light, texels = kept.light, placed.texels
+        if self._live is None or light is None:
+            yield pending
+            return
+        area = surface_areas(texels, placed.frame)
+        if kept.schedule is None:
+            threshold, patience = self._live.threshold, self._live.patience
+            kept.schedule = UpdateSchedule(texels.surface, area, threshold=threshold, patience=patience)
+        kept.schedule.set_area(area)
+        fresh = pending[pending < kept.store.kept]
+        fresh = fresh if kept.waiting is None else fresh[~kept.waiting[fresh]]
+        sent = radiosity.sent_by_targets(light.aim, placed.albedo, placed.emitted).max(axis=1)
+        flux = kept.store.at_stake(sent, fresh) * placed.frame.area[fresh]
+        of_surface = np.bincount(texels.surface[fresh], flux, minlength=texels.surface_count)
+        kept.schedule.add(np.asarray(of_surface, np.float64))
+        waits = np.zeros(texels.count, np.bool_)
+        waits[pending] = True
+        for part in within(self._live.budget, kept.schedule.order(waits, float(light.iim.mean(dtype=np.float64)))):
+            yield part
+            kept.schedule.updated(part)
+            waits[part] = False
+        kept.waiting = waits
 
     def light(
         self, placed: PlacedScene, links: Links, samples: SampleCounts, outside: Float32, aim: Float32 | None = None

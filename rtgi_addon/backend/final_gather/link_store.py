@@ -88,7 +88,7 @@ class LinkStore:
         return self._pending_texel.copy()
 
     def disturb(self, rays: GatherRays, sweep: Sweep, reach: Float32) -> int:
-        """Mark the links that the ``sweep`` touches; how many were looked at one by one.
+        """Mark the links that the ``sweep`` touches as pending; how many were looked at one by one.
 
         ``rays`` of the new frame; reach (n,) m: of each texel's points from its middle.
         """
@@ -119,6 +119,21 @@ class LinkStore:
         self._pending_texel |= whole
         self._pending_texel[texel[touched]] = True
         return tested
+
+    def at_stake(self, brightness: Float32, texel: Int32) -> Float32:
+        """(k,) W/m² that the pending links of ``texel`` (k,), all of them kept, bring where each target sends
+        ``brightness`` (m,) W/m²: about what their irradiance may change by."""
+        seen = np.append(brightness, np.float32(0)).astype(np.float32)
+        total = np.maximum(self.total[texel].sum(axis=1), 1e-30)
+        out = np.zeros(len(texel), np.float32)
+
+        def part(rows: slice) -> None:
+            of = texel[rows]
+            brought = self.weight[of] * seen.take(self.target[of]) * self._pending[of]
+            out[rows] = brought.sum(axis=1) / total[rows]
+
+        self._workers.map_slices(part, len(texel), self.chunk)
+        return out
 
     def renew(self, rays: GatherRays, texel: Int32) -> LinkWork:
         """Trace the pending links of ``texel`` (m,)."""

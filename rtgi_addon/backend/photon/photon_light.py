@@ -15,6 +15,7 @@ from ..selection.changes import Change
 from ..selection.schedule import UpdateSchedule
 from ..settings import LiveSettings
 from ..stats import FrameStats
+from ..surface.texels import surface_areas
 from .paths import PhotonPaths
 from .photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits, make_photon_map, photon_irradiance
 from .photon_store import PhotonStore, PhotonUpdate
@@ -107,7 +108,7 @@ class PhotonLight:
     def _due(self, placed: PlacedScene, hits: Hits, stale: Bool, live: LiveSettings) -> Bool:
         """(surface_count,) of the ``stale`` surfaces those to compute now, by Δ_f (Larsen04 §3)."""
         surface = placed.texels.surface
-        area = np.bincount(surface, placed.frame.area, minlength=len(stale))
+        area = surface_areas(placed.texels, placed.frame)
         if hits not in self._schedules:
             self._schedules[hits] = UpdateSchedule(
                 surface, area, threshold=live.threshold, patience=live.patience

@@ -10,11 +10,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from ..scene import Bool, Float32, Float64, Int32
+from ..settings import Budget
 
 #: A surface without area is divided by this instead, m².
 LEAST_AREA = float(np.finfo(np.float32).tiny)
@@ -22,20 +22,6 @@ LEAST_AREA = float(np.finfo(np.float32).tiny)
 CHUNK = 512
 #: In ``since``: the texel does not wait.
 NEVER = -1
-
-
-@dataclass(frozen=True)
-class Budget:
-    """What the updates of one frame may cost. With neither limit everything is done: a batch frame converges."""
-
-    texels: int | None = None
-    milliseconds: float | None = None
-
-    def __post_init__(self) -> None:
-        if self.texels is not None and self.texels < 1:
-            raise ValueError(f"a budget of {self.texels} texels updates nothing")
-        if self.milliseconds is not None and not self.milliseconds >= 0:
-            raise ValueError(f"a budget of {self.milliseconds} ms")
 
 
 class UpdateSchedule:

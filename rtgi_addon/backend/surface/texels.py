@@ -301,6 +301,11 @@ def _lifted_points(texels: Texels, geometry: Geometry, rows: Rows) -> Float32:
     return np.asarray(points + geometry.normals.take(triangle, axis=0) * lift, np.float32).reshape(-1, POINTS, 3)
 
 
+def surface_areas(texels: Texels, frame: TexelFrame) -> Float32:
+    """(surface_count,) m²"""
+    return np.asarray(np.bincount(texels.surface, frame.area, minlength=texels.surface_count), np.float32)
+
+
 def texel_colours(
     texels: Texels, scene: Scene, geometry: Geometry, materials: tuple[Material, ...]
 ) -> tuple[Float32, Float32]:
