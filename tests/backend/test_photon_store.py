@@ -450,19 +450,6 @@ def test_a_surface_that_slides_under_its_photons_is_stale() -> None:
     assert update.traced == 500 and update.delta_f.sum() < 0.01 * 10 and light.stale(movie.placed, Hits.DIRECT).all()
 
 
-def test_chosen_surfaces_first() -> None:
-    movie = Movie(*rich_scene(), photons=4000)
-    light = PhotonLight(movie.store(Selection.SWEPT), nearest=24)
-    movie.follow(light, movie.shot(movie.first))
-    parts = np.arange(movie.texels.surface_count) % 3
-    for part in range(3):
-        assert light.stale(movie.placed, Hits.BOUNCED).sum() == (parts >= part).sum()
-        got = light.irradiance(movie.placed, Hits.BOUNCED, surfaces=parts == part)
-        assert not got[parts[movie.texels.surface] > part].any()
-    assert not light.stale(movie.placed, Hits.BOUNCED).any()
-    assert got.tobytes() == density(movie, light.store.paths, 24).tobytes()
-
-
 def density(movie: Movie, paths: PhotonPaths, k: int, surfaces=None) -> np.ndarray:
     found = make_photon_map(paths, bounced_hits(paths) | ~lamp_hits(paths))
     return photon_irradiance(found, movie.texels, movie.placed.frame, movie.workers, k=k, surfaces=surfaces)
