@@ -60,7 +60,7 @@ class Finder:
 def variant_name(name: str, shown: Sequence[int], frames: Sequence[int]) -> str:
     """``name [frames 3 to 9, 14]``: that of the variant ``shown`` in these of ``frames``."""
     runs = []
-    for is_shown, run in groupby(dict.fromkeys(frames), set(shown).__contains__):
+    for is_shown, run in groupby(sorted(set(frames)), set(shown).__contains__):
         first, *others = run
         if is_shown:
             runs.append(f"{first} to {others[-1]}" if others else f"{first}")

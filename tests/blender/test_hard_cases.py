@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import subprocess
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ import pytest
 from mathutils import Matrix
 
 from rtgi_addon.backend.errors import BakeError
-from rtgi_addon.backend.settings import BakeSettings, Quality
+from rtgi_addon.backend.settings import BakeSettings, Quality, Selection
 from rtgi_addon.bake import BakeSummary, bake
 from rtgi_addon.cli import run
 from rtgi_addon.exr import read_page
@@ -390,6 +390,28 @@ def test_faces_that_change_are_lit_in_their_frames(
     (tmp_path / "out" / map_name("aim", 0, 4)).unlink()
     assert run(["bake", str(tmp_path / "a.blend"), *flags, "--frames", "1-6", "--resume"]) == 0
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").glob("*.exr")} == maps
+
+
+def test_faces_that_change_end_at_the_bits_of_a_bake_from_scratch(
+    baked: Callable[..., Maps], add_plane: AddObject
+) -> None:
+    """Of a lid that grows, shrinks to what it was and moves, over frames that go back and forth."""
+    add_plane("Floor", size=4)
+    lid = add_plane("Lid", size=1, location=(0, 0, 1))
+    array = lid.modifiers.new("Array", "ARRAY")
+    for frame, count in ((1, 1), (2, 2), (4, 1)):
+        array.count, lid.location.y = count, 0.2 * frame
+        array.keyframe_insert("count", frame=frame)
+        lid.keyframe_insert("location", frame=frame)
+    add_lamp((0, 0, 3))
+    order = (1, 4, 2, 3)
+    swept = baked(frames=order)
+    scratch = baked(frames=order, settings=replace(DRAFT, selection=Selection.OFF))
+    assert {name for name, _ in swept.rectangle} == {"Floor", "Lid [frames 1, 4]", "Lid [frames 2 to 3]"}
+    for frame in order:
+        for kind in ("iim", "aim"):
+            np.testing.assert_array_equal(swept.frames[frame][kind], scratch.frames[frame][kind], err_msg=str(frame))
+    assert swept.mean("Floor", frame=2) < 0.95 * swept.mean("Floor", frame=1)
 
 
 def test_faces_that_change_too_often_end_with_one_line(

@@ -155,6 +155,7 @@ def test_names_stay_unique_whatever_objects_are_called(add_plane: AddObject) -> 
 )
 def test_names_list_runs_of_baked_frames(frames: list[int], said: str) -> None:
     assert variants.variant_name("X", frames, range(-1, 16, 2)) == said
+    assert variants.variant_name("X", frames[::-1], range(15, -3, -2)) == said
 
 
 def test_other_materials_are_other_variants(add_cube: AddObject) -> None:
