@@ -29,7 +29,7 @@ from .environment import device, library_folders, versions
 from .exr import write_page
 from .extract import frame_state
 from .job import Plan
-from .output import FORMAT, BakeFolder, FrameFailed, digest, folder_problems, map_bytes, map_name, write_arrays
+from .output import FORMAT, GUIDE, BakeFolder, FrameFailed, digest, folder_problems, map_bytes, map_name, write_arrays
 from .source import SourceScene
 from .terminal import Listener
 
@@ -183,7 +183,7 @@ def header(plan: Plan) -> dict[str, Any]:
         "atlas": describe_atlas(plan.scene, plan.atlas),
         "setup_seconds": plan.setup_seconds,
         "warnings": list(plan.warnings),
-        "fingerprint": {**fingerprint(plan.scene, plan.atlas), "light over the frames asked for": digest(plan.guide)},
+        "fingerprint": {**fingerprint(plan.scene, plan.atlas), GUIDE: digest(plan.guide)},
     }
 
 

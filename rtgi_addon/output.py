@@ -29,7 +29,7 @@ FORMAT = 1
 #: A file being written, in the same folder, where renaming is atomic; what a killed bake may leave.
 PART = re.compile(r"\.((iim|aim|caustics)\.p\d+\.\d+\.exr|bake\.json|texels\.npz|probe\.\d+)\.part")
 #: Settings that change the speed of a bake and not one bit of its maps.
-WITHOUT_EFFECT = ("threads",)
+WITHOUT_EFFECT = ("threads", "link_memory", "estimate")
 #: Of a compressed RGBA float32 pixel: 8.7 measured on a page that is nearly full.
 BYTES_PER_PIXEL = 9
 
@@ -151,6 +151,10 @@ class FrameFailed(Exception):
         super().__init__("\n".join(problems))
 
 
+#: The part of the input that tells where gather rays are aimed in every frame.
+GUIDE = "range of frames, or what some of them show,"
+
+
 class BakeFolder:
     """``bake.json`` and the maps it lists. ``header`` is all of bake.json but its frames and its status.
 
@@ -223,10 +227,12 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     first = ("first frame", old.get("first_frame"), new.get("first_frame"))
     if first[1] != first[2]:  # everything that moves differs then, too
         return ["{} was {}, is {} now".format(*first)]
+    parts = [name for name, _, _ in _changed(old["fingerprint"], new["fingerprint"])]
     return (
         [f"{name} was {then}, is {now} now" for name, then, now in _changed(old["settings"], new["settings"])]
         + [f"{name} was {then}, is {now} now" for name, then, now in _changed(old["versions"], new["versions"])]
-        + [f"the {name} changed" for name, _, _ in _changed(old["fingerprint"], new["fingerprint"])]
+        # What the frames show differs with any other part, too: that says more.
+        + [f"the {name} changed" for name in parts if name != GUIDE or len(parts) == 1]
     )
 
 
