@@ -13,8 +13,9 @@ import pytest
 from rtgi_addon.backend.errors import BakeError
 from rtgi_addon.backend.progress import silent
 from rtgi_addon.backend.scene import FrameState
-from rtgi_addon.extract import extract_source, frame_state, variants
-from rtgi_addon.source import SourceScene
+from rtgi_addon.extract import evaluate_materials, extract_source, frame_state, variants
+from rtgi_addon.scene_file import default_frames
+from rtgi_addon.source import Layout, SourceScene
 
 AddObject = Callable[..., bpy.types.Object]
 CORNERS = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]
@@ -182,6 +183,39 @@ def test_other_materials_are_other_variants(add_cube: AddObject) -> None:
         assert shown(source, 2) == ["Swapped [frame 2]", "Painted [frame 2]", "Spare"]
 
 
+def test_textures_are_those_of_the_look(add_mesh: AddObject) -> None:
+    """A material that shows an attribute, which each mesh has another value of; the second is first met in frame 3."""
+    material = bpy.data.materials.new("Tinted")
+    if bpy.app.version < (5, 0):
+        material.use_nodes = True
+    nodes, links = material.node_tree.nodes, material.node_tree.links
+    nodes.clear()
+    tint, paint, end = (nodes.new(f"ShaderNode{kind}") for kind in ("Attribute", "BsdfDiffuse", "OutputMaterial"))
+    tint.attribute_name = "tint"
+    links.new(tint.outputs["Fac"], paint.inputs["Color"])
+    links.new(paint.outputs[0], end.inputs["Surface"])
+    obj = add_mesh("Skin", CORNERS, [(0, 1, 2), (0, 2, 3)], material=material)
+    datas = [obj.data, mesh_of("Other", [(0, 1, 2, 3)])]
+    datas[1].materials.append(material)
+    for data, value in zip(datas, (0.25, 0.75), strict=True):
+        data.attributes.new("tint", "FLOAT", "POINT").data.foreach_set("value", [value] * 4)
+
+    def swap(frame: int) -> None:
+        obj.data = datas[frame > 2]
+
+    lamp = bpy.data.objects.new("Lamp", bpy.data.lights.new("Lamp", "POINT"))
+    bpy.context.scene.collection.objects.link(lamp)
+    with each_frame(swap):
+        source = extract_source([1, 2, 3], silent)
+        bpy.context.scene.frame_set(1)
+        uv = np.array(CORNERS, np.float32)[..., :2]
+        layouts = [Layout(uv[m.triangles], np.zeros(2, np.int32), (1.0, 1.0)) for m in source.meshes]
+        appearance = evaluate_materials(source, layouts, [(8, 8)] * 2, silent)
+        assert bpy.context.scene.frame_current == 1
+    for albedo, value in zip(appearance.albedo_maps, (0.25, 0.75), strict=True):
+        np.testing.assert_allclose(albedo, value, atol=0.01)
+
+
 def test_visibility_to_light_that_changes(add_cube: AddObject) -> None:
     ghost = add_cube("Ghost")
     for path in ("visible_diffuse", "visible_shadow"):
@@ -234,6 +268,8 @@ def test_what_vanishes_altogether_is_no_variant(add_plane: AddObject) -> None:
     plane = add_plane("Built")
     build = plane.modifiers.new("Build", "BUILD")
     build.frame_start, build.frame_duration = 2, 1
+    bpy.context.scene.frame_end = 3
+    assert default_frames(bpy.context.scene) == range(1, 4)  # though nothing has a curve
     source = extract_source([1, 2, 3], silent)
     assert [i.name for i in source.instances] == ["Built"]
     assert [at(source, frame).visible.tolist() for frame in (1, 2, 3)] == [[False], [False], [True]]
