@@ -51,8 +51,9 @@ Sequences of 24 frames in which one thing changes (`bench/sequences.py`), baked 
 - **ms:** wall clock of `Session.advance`, from the frame's state to finished maps. Median over the frames after the
   first; from scratch over one frame in {SCRATCH_EVERY}. Slowest: the slowest frame with selection; for what happens
   once, the frame in which it does. Ratio: of the medians.
-- **Rays, links, photons:** means over the same frames. Tested: kept gather rays that were looked at one by one since
-  an object moved near them. Kept: the share that was not traced again.
+- **Rays, links, photons:** means over the same frames. Links traced: gather samples made anew; those whose target faces
+  away need no ray. Tested: kept ones that were looked at one by one since an object moved near them. Kept: the share
+  that was not made again.
 - **Error:** as for one frame above, but from bakes of our own: the mean of {len(SEEDS)} bakes of {CONVERGED.total} rays
   with other seeds, not denoised, every frame from scratch, at two frames; their own noise, at most {noise:.1%}, is
   taken out in quadrature. It shows noise and what the denoiser does to it; what the method itself leaves out, only the

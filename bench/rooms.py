@@ -25,6 +25,8 @@ from tests.backend.scenes import (
 Point = tuple[float, float, float]
 #: Half the gap between the two rooms; a door runs in it.
 HALF_GAP = 0.06
+#: Where the rooms' blocks of 0.5 m float, m.
+BLOCK_HEIGHT = 0.27
 #: The doorway: half its width and its height, and by how much the door is larger on every side.
 DOORWAY, DOOR_OVERLAP = (0.4, 1.5), 0.1
 
@@ -65,7 +67,8 @@ def two_rooms(texels_per_metre: float = 14.0, *, doorway: bool) -> tuple[Scene, 
     matrices = [np.eye(4)] * len(meshes)
     face = max(2, round(0.5 * texels_per_metre))
     meshes += [box(f"{name} block", (0.5, 0.5, 0.5), texels=face) for name in "AB"]
-    matrices += [translation(-1.2, 0.3, 0.25), translation(1.2, 0.3, 0.25)]
+    # Above the floor: texels that lie in its plane look down beside it, into the void that both rooms share.
+    matrices += [translation(-1.2, 0.3, BLOCK_HEIGHT), translation(1.2, 0.3, BLOCK_HEIGHT)]
     moving = {"A block"}
     if doorway:
         width, height = 2 * (DOORWAY[0] + DOOR_OVERLAP), DOORWAY[1] + 2 * DOOR_OVERLAP

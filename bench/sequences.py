@@ -16,7 +16,7 @@ from rtgi_addon.backend.scene import Atlas, Float32, Float64, FrameState, Instan
 from rtgi_addon.backend.settings import AimBounced
 from tests.backend.scenes import cornell, grid_atlas, mesh_of_triangles, point_light, translation
 
-from .rooms import door_at, larsen_box, turned, two_rooms
+from .rooms import BLOCK_HEIGHT, door_at, larsen_box, turned, two_rooms
 
 FRAMES = 24
 #: Guide frames of a sequence at most.
@@ -156,7 +156,7 @@ def door(texels_per_metre: float = 14.0, frames: int = FRAMES) -> FrameSequence:
 def closed_rooms(texels_per_metre: float = 14.0, frames: int = FRAMES) -> FrameSequence:
     """Two closed rooms; a block slides and turns in one."""
     scene, atlas = two_rooms(texels_per_metre, doorway=False)
-    states = _frames(lambda f, t: moved(scene, f, {"A block": turned(t, -1.6 + t, -0.4, 0.25)}), frames)
+    states = _frames(lambda f, t: moved(scene, f, {"A block": turned(t, -1.6 + t, -0.4, BLOCK_HEIGHT)}), frames)
     return FrameSequence("closed", "A block moves in one of two closed rooms", scene, atlas, states)
 
 

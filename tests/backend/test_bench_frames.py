@@ -23,7 +23,7 @@ from bench.report_plots import short
 from bench.results import Machine
 from bench.rooms import bumpy_cornell, hall, two_rooms
 from bench.scaling import Point, Sweep, slope
-from bench.sequences import SEQUENCES, FrameSequence, rigid_mover
+from bench.sequences import SEQUENCES, FrameSequence, closed_rooms, rigid_mover
 from rtgi_addon.backend.final_gather.bright import bright_targets
 from rtgi_addon.backend.final_gather.gather import GatherRays
 from rtgi_addon.backend.parallel import Workers
@@ -199,6 +199,15 @@ def test_a_played_sequence_is_measured_and_compared():
     assert played.errors[0].relative_rmse == pytest.approx(played.errors[1].relative_rmse, rel=1e-3)
     assert abs(played.errors[1].bias) < 0.05
     assert played.scratch.counts["rays"] >= played.texels * 16
+
+
+def test_a_mover_in_a_closed_room_updates_that_room_alone():
+    settings = BakeSettings(quality=Quality.DRAFT, denoise=False, threads=1)
+    played = play(closed_rooms(5.0, frames=4), settings, ())
+    updated, kept = (played.selected.counts[k] for k in ("surfaces_updated", "surfaces_kept"))
+    assert updated + kept == 24
+    assert 1 <= updated <= 12
+    assert played.difference <= 1e-5
 
 
 def test_a_gather_in_a_furnace_brings_its_radiosity():
