@@ -65,13 +65,17 @@ class PlacedScene:
         if self.surfaces is not surfaces or state.world is not before.world:
             self._shine(state)
         return Change(
-            sweep=Sweep(movement.places, moved, self.workers),
+            sweep=Sweep(movement.left, movement.taken, moved, self.workers),
             texels=texels,
             scattering=np.any(self.albedo != albedo, axis=1) if self.albedo is not albedo else None,
             passing=not _pass_alike(surfaces, self.surfaces),
             emitted=not np.array_equal(emitted, self.emitted),
             everything=movement.rebuilt or _layout_of(sky) != _layout_of(self.sky),
         )
+
+    def place_again(self) -> None:
+        """Place all texels, after a frame that was cut short."""
+        follow_texels(self.frame, self.texels, self.geometry, np.arange(self.texels.count))
 
     def _colour(self, state: FrameState) -> None:
         """Reflection, from materials and maps."""

@@ -103,6 +103,7 @@ class Session:
         self._photons = self._photon_light(live, diffuse=True)
         self._caustic_photons = self._photon_light(live, diffuse=False)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
+        self._broken = False  # a frame was cut short: what is kept may be of two frames
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
         self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers, live)
@@ -139,6 +140,10 @@ class Session:
 
     def advance(self, state: FrameState) -> FrameResult:
         """Light the frame ``state``."""
+        if self._broken:
+            self._forget()
+            self._placed.place_again()
+        self._broken = True
         stats, self._setup = self._setup or FrameStats(), None
         traced_in_setup, stats.photons_kept = stats.photons_traced, 0
         state, bounded = bounded_state(state, self.scene)
@@ -146,8 +151,7 @@ class Session:
         with stats.stage("place"):
             change = self._placed.follow(state)
             if self.settings.selection is Selection.OFF:
-                self._lighting.forget()
-                self._direct_store.clear()
+                self._forget()
             self._lighting.follow(self._placed, change, stats)
         self._report("place", 1, STAGE_COUNT)
         outside, caustic = self._outside(change, stats)
@@ -163,7 +167,15 @@ class Session:
         stats.photons_kept = max(stats.photons_kept - traced_in_setup, 0)
         stats.estimated_error = lit.estimated_error
         stats.warnings += self._finisher.warnings
+        self._broken = False
         return FrameResult(maps, stats)
+
+    def _forget(self) -> None:
+        """Keep no ray of the frames before."""
+        self._lighting.forget()
+        self._direct_store.clear()
+        self._photons.forget()
+        self._caustic_photons.forget()
 
     def _first_samples(self) -> SampleCounts:
         return PILOT if self.settings.target_error is not None else self.settings.samples

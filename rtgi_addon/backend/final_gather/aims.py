@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..lamps.sky import Sky
 from ..scene import Bool, Float32, Int32
@@ -26,6 +27,8 @@ class Aims:
 
     target: Int32  # (r P b,) texel, or texels' count + patch of sky
     is_sky: Bool  # (r P b,)
+    on: NDArray[np.int64]  # (r P b,) which of a texel's points
+    room: NDArray[np.int64]  # (r P b,) of the texels that aim so
     point: Float32  # (r P b, 3) local, lifted off the surface; of the sky a unit direction
     normal: Float32  # (r P b, 3) out of the target's side; zero for the sky
     density: Float32  # (r P b,) of samples on the target: per m², of the sky per sr
@@ -36,23 +39,48 @@ def place_aims(
 ) -> Aims:
     """The aims of ``table``'s samples where their targets lie in ``frame``."""
     chosen = bright.targets(table.choice.reshape(-1))  # (r, P b)
-    density = np.take_along_axis(target_density(bright, frame.area, sky), chosen, axis=1).reshape(-1)
     target = chosen.reshape(-1)
-    solid = target < texels.count
+    is_sky = target >= texels.count
     place = np.tile(table.target.reshape(-1, 2), (bright.room_count, 1))
-    points, normals = np.zeros((len(target), 3), np.float32), np.zeros((len(target), 3), np.float32)
-    t, on = target[solid], (place[solid, 0] * POINTS).astype(np.int64)
-    points[solid] = frame.points[t, on]
-    facing = np.where(texels.side[t] == BACK, np.float32(-1), np.float32(1))
-    normals[solid] = geometry.normals[texels.point_triangle[t, on]] * facing[:, None]
-    if sky is not None and not solid.all():
-        points[~solid] = sky.directions(target[~solid] - texels.count, place[~solid, 0], place[~solid, 1])
-    return Aims(target, ~solid, points, normals, density)
+    count = len(target)
+    aims = Aims(
+        target=target,
+        is_sky=is_sky,
+        on=(place[:, 0] * POINTS).astype(np.int64),
+        room=np.repeat(np.arange(bright.room_count), chosen.shape[1]),
+        point=np.zeros((count, 3), np.float32),
+        normal=np.zeros((count, 3), np.float32),
+        density=np.zeros(count, np.float32),
+    )
+    if sky is not None and is_sky.any():
+        rows = np.nonzero(is_sky)[0]
+        aims.point[rows] = sky.directions(target[rows] - texels.count, place[rows, 0], place[rows, 1])
+        aims.density[rows] = (
+            bright.probability[aims.room[rows], target[rows]] / sky.solid_angle[target[rows] - texels.count]
+        )
+    follow_aims(aims, np.nonzero(~is_sky)[0], bright, texels, frame, geometry)
+    return aims
+
+
+def follow_aims(
+    aims: Aims, rows: NDArray[np.int64], bright: BrightTargets, texels: Texels, frame: TexelFrame, geometry: Geometry
+) -> None:
+    """Bring the aims ``rows`` (k,), all at texels, to where those lie in ``frame``."""
+    target, on = aims.target[rows], aims.on[rows]
+    aims.point[rows] = frame.points[target, on]
+    facing = np.where(texels.side[target] == BACK, np.float32(-1), np.float32(1))
+    aims.normal[rows] = geometry.normals[texels.point_triangle[target, on]] * facing[:, None]
+    aims.density[rows] = density_on_texels(bright.probability[aims.room[rows], target], frame.area[target])
 
 
 def target_density(bright: BrightTargets, area: Float32, sky: Sky | None) -> Float32:
     """(r, m) of aimed samples on each target: probability per m² of a texel, per sr of a patch of sky."""
     count = len(area)
     solid_angle = np.float32(1) if sky is None else sky.solid_angle
-    on_texels = bright.probability[:, :count] / np.maximum(area, np.finfo(np.float32).tiny)
+    on_texels = density_on_texels(bright.probability[:, :count], area)
     return np.asarray(np.concatenate([on_texels, bright.probability[:, count:] / solid_angle], axis=1), np.float32)
+
+
+def density_on_texels(probability: Float32, area: Float32) -> Float32:
+    """1/m²; arrays that broadcast."""
+    return np.asarray(probability / np.maximum(area, np.finfo(np.float32).tiny), np.float32)

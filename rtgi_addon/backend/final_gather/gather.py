@@ -28,7 +28,7 @@ from ..surface.geometry import Geometry
 from ..surface.rasterise import POINTS
 from ..surface.texels import TexelFrame, Texels
 from ..surface.tracing import FREE, WALL, Hits, Tracer
-from .aims import Aims, place_aims, target_density
+from .aims import Aims, density_on_texels, follow_aims, place_aims, target_density
 from .bright import BrightTargets
 from .patterns import PATTERNS, bright_patterns, cosine_patterns, pattern_of_texels
 
@@ -107,7 +107,7 @@ class GatherRays:
         self._tracer, self._surfaces, self._sky = tracer, surfaces, sky
         self._max_specular, self._seed = max_specular, seed
         self._see_through = bool(surfaces.passes.any())
-        self._density = target_density(bright, frame.area, sky).reshape(-1)
+        self._bright, self._density = bright, target_density(bright, frame.area, sky)
         self._first_density = bright.room * np.int32(self.target_count)  # (n,) of each texel's room
         tangent, bitangent = frames(frame.normal)
         self.axes = [np.ascontiguousarray(a.T) for a in (tangent, bitangent, frame.normal)]  # (3, n) each
@@ -118,6 +118,23 @@ class GatherRays:
         self.aims: Aims | None = None
         if self.bright_table is not None:
             self.aims = place_aims(self.bright_table, bright, texels, frame, geometry, sky)
+
+    def follow(self, moved: Bool, surfaces: Surfaces) -> None:
+        """Bring all to the frame that the scene stands in now; only the texels ``moved`` (n,) are not where they were.
+
+        The same bits as a new one would have. The sky must have the patches it had.
+        """
+        self._surfaces, self._see_through = surfaces, bool(surfaces.passes.any())
+        rows = np.nonzero(moved)[0]
+        if not len(rows):
+            return
+        normal = self.frame.normal[rows]
+        for mine, now in zip(self.axes, (*frames(normal), normal), strict=True):
+            mine[:, rows] = now.T
+        self._density[:, rows] = density_on_texels(self._bright.probability[:, rows], self.frame.area[rows])
+        if self.aims is not None:
+            at_moved = np.nonzero(~self.aims.is_sky & np.append(moved, False).take(self.aims.target, mode="clip"))[0]
+            follow_aims(self.aims, at_moved, self._bright, self.texels, self.frame, self.geometry)
 
     def trace(self, texel: Int32) -> TracedTexels:
         """All rays of the texels (m,)."""
@@ -166,7 +183,7 @@ class GatherRays:
         weight = np.full(len(texel), 1 / np.float32(self.n_cosine), np.float32)
         if self.n_bright:
             per_area = hits.distance * hits.distance / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
-            density = self._density.take(self._first_density.take(texel) + target, mode="clip") * np.where(
+            density = self._density.reshape(-1).take(self._first_density.take(texel) + target, mode="clip") * np.where(
                 escaped, np.float32(1), per_area
             )
             density[target < 0] = 0

@@ -75,19 +75,22 @@ class Lighting:
         self._settings, self._bright, self._workers, self._live = settings, bright, workers, live
         self._kept: dict[SampleCounts, _Kept] = {}
         self._used: set[SampleCounts] = set()
-        self._rays: dict[SampleCounts, GatherRays] = {}  # of this frame
+        self._rays: dict[SampleCounts, GatherRays] = {}
 
     def forget(self) -> None:
         """Keep nothing: the next frame starts from scratch."""
         self._kept.clear()
+        self._rays.clear()
 
     def follow(self, placed: PlacedScene, change: Change, stats: FrameStats) -> None:
         """Mark the links that ``change`` disturbs, once a frame; those the frame before did not use are dropped."""
         self._kept = {samples: kept for samples, kept in self._kept.items() if samples in self._used}
+        self._rays = {samples: rays for samples, rays in self._rays.items() if samples in self._used}
         self._used = set()
-        self._rays = {}
         if not change.rays_hold:
-            self._kept.clear()
+            self.forget()
+        for rays in self._rays.values():
+            rays.follow(change.texels, placed.surfaces)
         if not change.sweep.any:
             return
         for samples, kept in self._kept.items():

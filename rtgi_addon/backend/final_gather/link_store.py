@@ -19,13 +19,17 @@ from ..selection.sweep import Sweep
 from .beyond_store import BeyondStore
 from .components import SurfaceGraph
 from .gather import NO_TARGET, GatherRays, TracedTexels
-from .touched import touched_rays
+from .touched import Kept, touched_rays
 
 #: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
 #: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
 LEAST_FREE_SHARE = 0.9
 #: Target, weight and pending mark of a link; a cosine ray's length besides.
 BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
+
+
+#: Pieces that work is cut into, at the least: enough for the threads of most machines, few enough to stay large.
+PARTS = 8
 
 
 @dataclass
@@ -99,17 +103,17 @@ class LinkStore:
         whole = moved | self._cut_near(rays, sweep, reach)
         texel = np.nonzero(~(whole[: self.kept] | self._pending.all(axis=1)))[0].astype(np.int32)
 
+        moved_column = np.append(moved, np.zeros(self.nothing + 1 - self.count, np.bool_))
+
         def part(rows: slice) -> int:
             of = texel[rows]
-            open_aims = self.target[of][:, self._aimed_slots] != self.nothing
-            found = touched_rays(rays, sweep, of, self._distance[of], open_aims, reach)
-            mark = np.zeros((len(of), self.target.shape[1]), np.bool_)
+            found = touched_rays(rays, sweep, of, self._known(of, moved_column), reach)
+            mark = np.empty((len(of), self.target.shape[1]), np.bool_)
             mark[:, self._cosine_slots], mark[:, self._aimed_slots] = found.cosine, found.aimed
             self._pending[of] |= mark
             return found.tested
 
-        chunk = max(1, CHUNK_RAYS // self.target.shape[1])
-        tested = sum(self._workers.map_slices(part, len(texel), chunk))
+        tested = sum(self._workers.map_slices(part, len(texel), self.chunk_of(len(texel))))
         of, number = self.beyond.touched(sweep)
         self._pending[of, self._cosine_slots[number]] = True
         touched = self._pending[texel].any(axis=1) if len(texel) else np.zeros(0, np.bool_)
@@ -150,6 +154,20 @@ class LinkStore:
         self._pending_texel[texel] = False
         return work
 
+    def _known(self, texel: Int32, moved_column: Bool) -> Kept:
+        """What is stored of the rays of ``texel`` (m,); ``moved_column`` (m + 1,): targets that moved."""
+        target = self.target.take(texel, axis=0)
+        hit, aim = target.take(self._cosine_slots, axis=1), target.take(self._aimed_slots, axis=1)
+        distance = self._distance.take(texel, axis=0)
+        seen = self.weight.take(texel, axis=0).take(self._aimed_slots, axis=1) > 0
+        return Kept(
+            hits_moved=moved_column.take(hit),
+            hits_unknown=(hit == self.nothing) & np.isfinite(distance),
+            distance=distance,
+            seen=seen,
+            hidden=(aim != self.nothing) & ~seen,
+        )
+
     def _cut_near(self, rays: GatherRays, sweep: Sweep, reach: Float32) -> Bool:
         """(n,) texels that are cut through and that a place comes near to."""
         near = np.zeros(self.count, np.bool_)
@@ -165,10 +183,10 @@ class LinkStore:
         if not len(texel):
             return texel
         pending = self._pending[texel]
-        at = np.nonzero(pending)
-        links = texel[at[0]], at[1]
+        row, slot = np.divmod(np.flatnonzero(pending), pending.shape[1])
+        links = texel[row], slot
         self.graph.remove(*self._pairs(*links))
-        row, number = np.nonzero(pending[:, self._cosine_slots])
+        row, number = np.divmod(np.flatnonzero(pending[:, self._cosine_slots]), self._cosine)
         of, number = texel[row], number.astype(np.int32)
         beyond = []
 
@@ -183,7 +201,7 @@ class LinkStore:
             beyond.append((rows.start, found))
             return len(t) + found.rays, t[fan.dark]
 
-        done = self._workers.map_slices(cosine, len(of))
+        done = self._workers.map_slices(cosine, len(of), _even(len(of), CHUNK_RAYS))
         work.traced += sum(d[0] for d in done)
         work.renewed += int(np.count_nonzero(pending))
         self.beyond.replace_rays(of, number, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
@@ -194,7 +212,7 @@ class LinkStore:
         return np.asarray(np.unique(np.concatenate([np.zeros(0, np.int32), *(d[1] for d in done)])))
 
     def _renew_aimed(self, rays: GatherRays, texel: Int32, pending: Bool) -> int:
-        row, number = np.nonzero(pending[:, self._aimed_slots])
+        row, number = np.divmod(np.flatnonzero(pending[:, self._aimed_slots]), self._bright)
         of, number = texel[row], number.astype(np.int32)
 
         def aimed(rows: slice) -> int:
@@ -204,7 +222,7 @@ class LinkStore:
             self.target[t, slot], self.weight[t, slot] = self._column(found.target), found.weight
             return found.cast
 
-        return sum(self._workers.map_slices(aimed, len(of)))
+        return sum(self._workers.map_slices(aimed, len(of), _even(len(of), CHUNK_RAYS)))
 
     def _renew_texels(self, rays: GatherRays, texel: Int32, work: LinkWork) -> None:
         """Trace all links of ``texel``."""
@@ -232,7 +250,7 @@ class LinkStore:
                 beyond.append((rows.start, traced.beyond))
             return traced.rays
 
-        work.traced += sum(self._workers.map_slices(part, len(texel), self.chunk))
+        work.traced += sum(self._workers.map_slices(part, len(texel), self.chunk_of(len(texel))))
         work.renewed += len(kept) * self.target.shape[1]
         self.graph.add(*self._pairs(kept))
         self._filled = True
@@ -249,6 +267,10 @@ class LinkStore:
         """Texels worked on at a time."""
         return max(1, CHUNK_RAYS // self.target.shape[1])
 
+    def chunk_of(self, texels: int) -> int:
+        """:attr:`chunk`, or less where that would leave threads without work."""
+        return _even(texels, self.chunk)
+
     def _column(self, target: Int32) -> Int32:
         return np.where(target == NO_TARGET, np.int32(self.nothing), target)
 
@@ -258,6 +280,12 @@ class LinkStore:
         at = texel if slot is None else (texel, slot)
         target = self._surface_of_column.take(self.target[at])
         return row, np.where(self.weight[at] > 0, target, np.int32(-1))
+
+
+def _even(total: int, most: int) -> int:
+    """Items worked on at a time, at most ``most``, so that there are PARTS pieces of work or more. No result hangs on
+    it."""
+    return max(1, min(most, -(-total // PARTS)))
 
 
 def _totals(weight: Float32) -> Float64:

@@ -10,56 +10,77 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..sampling import dot
 from ..scene import Bool, Float32, Int32
-from ..selection.sweep import CULL_MARGIN, END_MARGIN, Sweep, meets
+from ..selection.sweep import CULL_MARGIN, END_MARGIN, Sweep, meets, touched_by
 from ..surface.tracing import Place
 from .gather import GatherRays
 
 
 @dataclass(frozen=True)
+class Kept:
+    """What is stored of the rays of m texels, none of which moved."""
+
+    hits_moved: Bool  # (m, cosine) the ray ended on an instance that moved
+    hits_unknown: Bool  # (m, cosine) it ended on a side that no texel tells of
+    distance: Float32  # (m, cosine) m, inf where it escaped
+    seen: Bool  # (m, bright) the aim is in sight
+    hidden: Bool  # (m, bright) something that may move stands before it
+
+
+@dataclass(frozen=True)
 class Touched:
-    """Of m texels: which rays meet a place."""
+    """Of m texels: which rays an object touches, where it was or where it is."""
 
     cosine: Bool  # (m, cosine)
     aimed: Bool  # (m, bright)
     tested: int  # rays that were looked at one by one
 
 
-def touched_rays(
-    rays: GatherRays, sweep: Sweep, texel: Int32, distance: Float32, open_aims: Bool, reach: Float32
-) -> Touched:
-    """The rays of ``texel`` (m,), which did not move.
+def touched_rays(rays: GatherRays, sweep: Sweep, texel: Int32, kept: Kept, reach: Float32) -> Touched:
+    """The rays of ``texel`` (m,); reach (n,) of all texels' points from their middle.
 
-    distance (m, cosine) of their hits · open_aims (m, bright) False: nothing that moves can uncover the aim · reach
-    (n,) of all texels' points from their middle. Aimed samples whose target moved count as touched, whether they meet
-    it or not.
+    A ray that met an object where it was ended on it, and an aim in sight had nothing before it; so the places left
+    matter only for what is not known. Samples that aim at what moved count as touched, whether they meet it or not.
     """
-    cosine = np.zeros((len(texel), rays.n_cosine), np.bool_)
-    aimed = np.zeros((len(texel), rays.n_bright), np.bool_)
-    tested = 0
+    cosine = kept.hits_moved.copy()
+    aimed = np.zeros(kept.seen.shape, np.bool_)
+    at, of, number = _chosen(kept.hits_unknown & ~cosine, texel)
+    _, origins, directions = rays.cosine_segments(of, number)
+    cosine.reshape(-1)[at] = touched_by(sweep.left, origins, directions, kept.distance.reshape(-1)[at])
+    tested = len(at)
     if rays.aims is not None:
         aimed |= _aimed_at_moved(rays, sweep, texel)
-    for place in sweep.places:
+        at, of, number = _chosen(kept.hidden & ~aimed, texel)
+        aim, _, origins, ways = rays.aimed_segments(of, number)
+        aimed.reshape(-1)[at] = touched_by(sweep.left, origins, ways, _ends(rays, aim))
+        tested += len(at)
+    for place in sweep.taken:
         view = _view(rays, place, texel, reach)
-        row, number = np.nonzero(_cosine_near(rays, view, texel, distance) & ~cosine)
-        tested += len(row)
-        if len(row):
-            of, number = texel[row], number.astype(np.int32)
-            _, origins, directions = rays.cosine_segments(of, number)
-            met = meets(place, origins, directions, distance[row, number])
-            cosine[row[met], number[met]] = True
-        if rays.aims is None:
-            continue
-        row, number = np.nonzero(_aimed_near(rays, view, texel) & open_aims & ~aimed)
-        tested += len(row)
-        if len(row):
-            at, _, origins, ways = rays.aimed_segments(texel[row], number.astype(np.int32))
-            ends = np.where(rays.aims.is_sky.take(at), np.float32(np.inf), np.float32(1))
-            met = meets(place, origins, ways, ends)
-            aimed[row[met], number[met]] = True
+        at, of, number = _chosen(_cosine_near(rays, view, texel, kept.distance) & ~cosine, texel)
+        _, origins, directions = rays.cosine_segments(of, number)
+        cosine.reshape(-1)[at] = meets(place, origins, directions, kept.distance.reshape(-1)[at])
+        tested += len(at)
+        if rays.aims is not None:
+            at, of, number = _chosen(_aimed_near(rays, view, texel) & kept.seen & ~aimed, texel)
+            aim, _, origins, ways = rays.aimed_segments(of, number)
+            aimed.reshape(-1)[at] = meets(place, origins, ways, _ends(rays, aim))
+            tested += len(at)
     return Touched(cosine, aimed, tested)
+
+
+def _chosen(mask: Bool, texel: Int32) -> tuple[NDArray[np.int64], Int32, Int32]:
+    """((r,) flat place, (r,) texel, (r,) number) of the rays in ``mask`` (m, K)."""
+    at = np.flatnonzero(mask)  # several times faster than nonzero in two dimensions
+    row = at // max(mask.shape[1], 1)
+    return at, texel[row], (at - row * mask.shape[1]).astype(np.int32)
+
+
+def _ends(rays: GatherRays, aim: NDArray[np.int64]) -> Float32:
+    assert rays.aims is not None
+    return np.where(rays.aims.is_sky.take(aim), np.float32(np.inf), np.float32(1))
 
 
 @dataclass(frozen=True)

@@ -46,6 +46,12 @@ class PhotonLight:
         self._schedules: dict[Hits, UpdateSchedule] = {}
         self._maps: dict[Hits, Float32] = {}
         self._stale: dict[Hits, Bool] = {}
+        self._lost = False
+
+    def forget(self) -> None:
+        """Rely on no photon: the next frame traces all."""
+        self._lost = True
+        self._schedules, self._maps, self._stale = {}, {}, {}
 
     def follow(
         self,
@@ -62,9 +68,10 @@ class PhotonLight:
         update = self.store.update(
             sources, counts, surfaces=placed.surfaces, tracer=placed.tracer, workers=placed.workers,
             sweep=change.sweep, instance_of_triangle=placed.geometry.instance_of_triangle,
-            rebuilt=change.everything,
+            rebuilt=change.everything or self._lost,
             budget=self._live.photons if self._live is not None and self._maps else None,
         )  # fmt: skip
+        self._lost = False
         for hits, stale in self._stale.items():
             delta = update.delta_aim if hits is Hits.BOUNCED else update.delta_f
             stale |= delta > 0

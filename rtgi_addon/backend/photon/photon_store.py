@@ -228,13 +228,13 @@ class PhotonStore:
             touched |= materials[surfaces.material_of_triangle[triangle]]
         if sweep.any:
             touched |= sweep.moved[instance_of_triangle[triangle]]
-            touched |= sweep.touches(pool.hit("start"), pool.hit("direction"), pool.hit("distance"))
+            touched |= sweep.enters(pool.hit("start"), pool.hit("direction"), pool.hit("distance"))
         self._due[path[touched & (path != NOBODY)]] = True
         if sweep.any:
             rows = np.nonzero((pool.of_path("end") == END_ESCAPED) & ~self._due)[0]
             endless = np.full(len(rows), np.inf, np.float32)
             origin, direction = pool.of_path("end_origin")[rows], pool.of_path("end_direction")[rows]
-            self._due[rows[sweep.touches(origin, direction, endless)]] = True
+            self._due[rows[sweep.enters(origin, direction, endless)]] = True
 
     def _probe(self, frame: _Frame) -> tuple[int, int, int]:
         """One photon of each group: (traced, gone another way, rays); groups of the latter are due."""

@@ -28,7 +28,8 @@ CULL_MARGIN = 1e-4
 class Sweep:
     """All places that moved, deformed, appearing and vanishing objects left and took."""
 
-    places: tuple[Place, ...]
+    left: tuple[Place, ...]
+    taken: tuple[Place, ...]
     moved: Bool  # (instances,)
     workers: Workers = field(repr=False)
 
@@ -37,27 +38,41 @@ class Sweep:
         """False: no instance differs from the frame before."""
         return bool(self.moved.any())
 
+    @property
+    def places(self) -> tuple[Place, ...]:
+        """Old and new ones."""
+        return self.left + self.taken
+
     def touches(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
         """(n,) does origin + [0, distance] · direction meet an object at any of the places?
 
         origins, directions (n, 3) local space, directions of any length; distances (n,) in units of it, inf for rays
         that escaped.
         """
+        return self._meet(self.places, origins, directions, distances)
 
+    def enters(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
+        """(n,) does it meet one where it is now? Enough for rays of which it is known what they hit: those that met
+        an object where it was ended on it."""
+        return self._meet(self.taken, origins, directions, distances)
+
+    def _meet(self, places: tuple[Place, ...], origins: Float32, directions: Float32, distances: Float32) -> Bool:
         def part(rows: slice) -> Bool:
-            return self._touches(origins[rows], directions[rows], distances[rows])
+            return touched_by(places, origins[rows], directions[rows], distances[rows])
 
-        parts = self.workers.map_slices(part, len(origins), CHUNK_RAYS) if self.places else []
+        parts = self.workers.map_slices(part, len(origins), CHUNK_RAYS) if places else []
         return np.concatenate(parts) if parts else np.zeros(len(origins), np.bool_)
 
-    def _touches(self, origins: Float32, directions: Float32, distances: Float32) -> Bool:
-        touched = np.zeros(len(origins), np.bool_)
-        for place in self.places:
-            rows = near(place, origins, directions, distances)
-            rows = rows[~touched[rows]]
-            if len(rows):
-                touched[rows] = meets(place, origins[rows], directions[rows], distances[rows])
-        return touched
+
+def touched_by(places: tuple[Place, ...], origins: Float32, directions: Float32, distances: Float32) -> Bool:
+    """(n,) does the segment meet an object at any of ``places``?"""
+    touched = np.zeros(len(origins), np.bool_)
+    for place in places:
+        rows = near(place, origins, directions, distances)
+        rows = rows[~touched[rows]]
+        if len(rows):
+            touched[rows] = meets(place, origins[rows], directions[rows], distances[rows])
+    return touched
 
 
 def meets(place: Place, origins: Float32, directions: Float32, distances: Float32) -> Bool:

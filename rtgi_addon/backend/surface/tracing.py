@@ -103,7 +103,8 @@ class Place:
 class Movement:
     """How the tracer's world changed from one frame to the next."""
 
-    places: tuple[Place, ...] = ()  # left behind and newly taken
+    left: tuple[Place, ...] = ()  # where objects were that moved on or vanished
+    taken: tuple[Place, ...] = ()  # where objects are that moved or appeared
     rebuilt: bool = False  # what was said to stay put did not: nothing known about any ray holds
 
 
@@ -130,14 +131,9 @@ class EmbreeTracer:
             i: before[i] if i in before and i not in moved else self._place(i, state, before.get(i))
             for i in self._present(moving=True)
         }
-        places = [
-            place
-            for i in sorted(before.keys() | self._movers.keys())
-            if before.get(i) is not self._movers.get(i)
-            for place in (before.get(i), self._movers.get(i))
-            if place is not None
-        ]
-        return Movement(tuple(places), rebuilt)
+        other = [i for i in sorted(before.keys() | self._movers.keys()) if before.get(i) is not self._movers.get(i)]
+        left, taken = (tuple(places[i] for i in other if i in places) for places in (before, self._movers))
+        return Movement(left, taken, rebuilt)
 
     def intersect(self, origins: Float32, directions: Float32) -> Hits:
         chunks = self._workers.map_slices(lambda s: self._intersect(origins[s], directions[s]), len(origins))
