@@ -43,7 +43,7 @@ class Bake:
     def advance(self, state: FrameState) -> DirectUpdate:
         moved = self.geometry.update(state)
         movement = self.tracer.update(state, moved)
-        sweep = Sweep(movement.places, np.isin(np.arange(len(self.scene.instances)), moved), self.workers)
+        sweep = Sweep(movement.left, movement.taken, np.isin(np.arange(len(self.scene.instances)), moved), self.workers)
         first = np.isnan(self.before).any()
         shadows = make_shadows(self.tracer, self.geometry, state.materials or self.scene.materials)
         frame = place_texels(self.texels, self.geometry)

@@ -17,7 +17,7 @@ from ..sampling import dot, stratified_pair, unit_float32
 from ..scene import Bool, Float32, Float64, Int32, Light, LightKind, Material
 from ..surface.geometry import Geometry
 from ..surface.texels import TexelFrame
-from ..surface.tracing import Tracer
+from ..surface.tracing import FREE, WALL, Tracer
 from .lamp_view import may_see, view_lamp
 from .lights import is_dark
 
@@ -33,12 +33,16 @@ class Shadows:
     geometry: Geometry
     transparency: Float32 | None  # (materials,) 1 - opacity; None: every material is opaque
 
-    def passing(self, origins: Float32, directions: Float32, distances: Float32) -> tuple[Float32, int]:
-        """((n,) share that arrives, rays traced). Glass and mirrors block, as in Cycles without shadow caustics."""
+    def passing(self, origins: Float32, directions: Float32, distances: Float32) -> tuple[Float32, Bool, int]:
+        """((n,) share that arrives, (n,) none ever will, whatever moves, rays traced).
+
+        Glass and mirrors block, as in Cycles without shadow caustics.
+        """
         if self.transparency is None:
-            free = ~self.tracer.occluded(origins, directions, distances)
-            return free.astype(np.float32), len(origins)
-        return self._through_sheets(self.transparency, origins, directions, distances)
+            blocked = self.tracer.blocked(origins, directions, distances)
+            return (blocked == FREE).astype(np.float32), np.asarray(blocked == WALL), len(origins)
+        share, rays = self._through_sheets(self.transparency, origins, directions, distances)
+        return share, np.zeros(len(origins), np.bool_), rays
 
     def _through_sheets(
         self, transparency: Float32, origins: Float32, directions: Float32, distances: Float32
@@ -107,9 +111,10 @@ def direct_irradiance(
         if not is_dark(light):
             texels = np.nonzero(reached(light, receivers, shadows.geometry.origin))[0].astype(np.int32)
             strength = np.zeros(len(total), np.float32)
-            strength[texels], traced = lamp_irradiance(light, number, texels, receivers, shadows, workers, seed=seed)
+            got = lamp_irradiance(light, number, texels, receivers, shadows, workers, seed=seed)
+            strength[texels] = got.strength
             total += irradiance_of(light, strength)
-            rays += traced
+            rays += got.rays
     return total, rays
 
 
@@ -126,28 +131,35 @@ def reached(light: Light, receivers: Receivers, origin: Float64, texels: Int32 |
     return seen & may_see(light, position, frame.geometric_normal[texels], reach, origin=origin)
 
 
+@dataclass(frozen=True)
+class LampLight:
+    """What a lamp gives k texels."""
+
+    strength: Float32  # (k,) 1/m², irradiance per unit of the lamp's power
+    walled: Bool  # (k,) it will give nothing else as long as texel and lamp stay, whatever else moves
+    rays: int
+
+
 def lamp_irradiance(
     light: Light, number: int, texels: Int32, receivers: Receivers, shadows: Shadows, workers: Workers, *, seed: int
-) -> tuple[Float32, int]:
-    """((k,) 1/m², rays traced): irradiance of ``texels`` (k,) per unit of ``light.power``.
+) -> LampLight:
+    """The light of ``texels`` (k,), of which one that is not :func:`reached` gets nothing.
 
-    ``number`` seeds its samples. A texel gets the same bits whichever others are asked for with it; one that is not
-    :func:`reached` gets nothing.
+    ``number`` seeds its samples. A texel gets the same bits whichever others are asked for with it.
     """
 
-    def part(rows: slice) -> tuple[Float32, int]:
+    def part(rows: slice) -> LampLight:
         return _sampled(light, number, texels[rows], receivers, shadows, seed)
 
     done = workers.map_slices(part, len(texels), max(1, CHUNK_RAYS // receivers.samples))
     if not done:
-        return np.zeros(0, np.float32), 0
-    return np.concatenate([d[0] for d in done]), sum(d[1] for d in done)
+        return LampLight(np.zeros(0, np.float32), np.zeros(0, np.bool_), 0)
+    strength, walled = np.concatenate([d.strength for d in done]), np.concatenate([d.walled for d in done])
+    return LampLight(strength, walled, sum(d.rays for d in done))
 
 
-def _sampled(
-    light: Light, number: int, texels: Int32, receivers: Receivers, shadows: Shadows, seed: int
-) -> tuple[Float32, int]:
-    """((k,) 1/m², rays) for the texels (k,) of one chunk."""
+def _sampled(light: Light, number: int, texels: Int32, receivers: Receivers, shadows: Shadows, seed: int) -> LampLight:
+    """Of the texels (k,) of one chunk."""
     frame, samples = receivers.frame, receivers.samples
     keys = texels.astype(np.uint32)
     of_ray = np.repeat(texels, samples)
@@ -163,14 +175,17 @@ def _sampled(
     faces = dot(frame.geometric_normal[of_ray], view.direction) > 0
     strength = np.where(faces, np.maximum(cosine, 0), 0) * view.strength
     rows = np.nonzero(strength > 0)[0]
+    open_rays = strength > 0
     rays = 0
     if light.casts_shadow and len(rows):
         # Lamps may lie on a wall: the ray ends before it.
         distances = view.distance[rows] - lift[rows] * (0 if light.kind == LightKind.SUN else 2)
         near = distances <= 0
-        passing, rays = shadows.passing(points[rows], view.direction[rows], np.maximum(distances, 0))
+        passing, walled, rays = shadows.passing(points[rows], view.direction[rows], np.maximum(distances, 0))
         strength[rows] *= np.where(near, np.float32(1), passing)
-    return strength.reshape(-1, samples).sum(axis=1) / np.float32(samples), rays
+        open_rays[rows] = ~walled | near
+    mean = strength.reshape(-1, samples).sum(axis=1) / np.float32(samples)
+    return LampLight(mean, ~open_rays.reshape(-1, samples).any(axis=1), rays)
 
 
 def _far(geometry: Geometry) -> float:

@@ -2,7 +2,7 @@
 """Direct light kept from frame to frame: of each lamp the irradiance that it gives per unit of its power.
 
 A lamp that only dims or changes colour costs no ray. Where objects moved, only texels whose shadow rays to a lamp may
-meet them are computed again. What is kept has the bits that a fresh computation would give. 5 bytes a texel and lamp.
+meet them are computed again. What is kept has the bits that a fresh computation would give. 6 bytes a texel and lamp.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from ..scene import Bool, Float32, Int32, Light, LightKind
 from ..selection.sweep import Sweep
 from ..surface.geometry import Geometry
 from ..surface.texels import TexelFrame
-from .direct import Receivers, Shadows, irradiance_of, lamp_irradiance, make_receivers, reached
+from .direct import LampLight, Receivers, Shadows, irradiance_of, lamp_irradiance, make_receivers, reached
 from .lights import is_dark
 from .shading_balls import Balls, may_shade, no_balls, together
 
@@ -44,6 +44,7 @@ class _Lamp:
     shape: tuple[object, ...]
     reached: Bool  # (n,) see ``direct.reached``
     strength: Float32  # (n,) 1/m²
+    walled: Bool  # (n,) see ``direct.LampLight``
     balls: Balls  # rays through them may fare otherwise now
     moved: Bool | None  # (n,) texels that are not where they were; None: none
 
@@ -131,13 +132,14 @@ class DirectStore:
         if lamp is not None and lamp.shape == _shape(light):
             return _renewed(lamp, light, number, now, differ)
         seen = reached(light, now.receivers, now.shadows.geometry.origin)
-        strength = np.zeros(len(seen), np.float32)
+        strength, walled = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.bool_)
         texels = np.nonzero(seen)[0].astype(np.int32)
-        strength[texels], rays = _strength(light, number, texels, now)
+        got = _light(light, number, texels, now)
+        strength[texels], walled[texels] = got.strength, got.walled
         if lamp is not None:
             differ |= _bits(lamp.strength) != _bits(strength)
-        self._lamps[number] = _Lamp(_shape(light), seen, strength, no_balls(), None)
-        return len(texels), rays
+        self._lamps[number] = _Lamp(_shape(light), seen, strength, walled, no_balls(), None)
+        return len(texels), got.rays
 
     def _sum(self, lights: Sequence[Light], differ: Bool) -> tuple[Float32, Bool]:
         """((n, 3) W/m² of all lamps, (n,) where that is new). ``differ``: where some lamp's strength is."""
@@ -229,14 +231,14 @@ def _renewed(lamp: _Lamp, light: Light, number: int, now: _Now, differ: Bool) ->
         differ[lost] |= lamp.strength[lost] != 0
         lamp.strength[lost] = 0
     if light.casts_shadow and len(lamp.balls.radius):
-        texels = np.nonzero(lamp.reached & ~again)[0]
+        texels = np.nonzero(lamp.reached & ~lamp.walled & ~again)[0]
         again[texels] = _shaded(light, texels, lamp.balls, now)
     texels = np.nonzero(again & lamp.reached)[0].astype(np.int32)
-    strength, rays = _strength(light, number, texels, now)
-    differ[texels] |= _bits(strength) != _bits(lamp.strength[texels])
-    lamp.strength[texels] = strength
+    got = _light(light, number, texels, now)
+    differ[texels] |= _bits(got.strength) != _bits(lamp.strength[texels])
+    lamp.strength[texels], lamp.walled[texels] = got.strength, got.walled
     lamp.balls, lamp.moved = no_balls(), None
-    return len(texels), rays
+    return len(texels), got.rays
 
 
 def _shaded(light: Light, texels: Int32, balls: Balls, now: _Now) -> Bool:
@@ -251,7 +253,7 @@ def _shaded(light: Light, texels: Int32, balls: Balls, now: _Now) -> Bool:
     return np.concatenate(parts) if parts else np.zeros(0, np.bool_)
 
 
-def _strength(light: Light, number: int, texels: Int32, now: _Now) -> tuple[Float32, int]:
+def _light(light: Light, number: int, texels: Int32, now: _Now) -> LampLight:
     return lamp_irradiance(light, number, texels, now.receivers, now.shadows, now.workers, seed=now.seed)
 
 
