@@ -256,3 +256,18 @@ def test_a_sky_that_dims_keeps_its_photons(factor: float) -> None:
     one, other = emitted
     assert one.origin.tobytes() == other.origin.tobytes() and one.direction.tobytes() == other.direction.tobytes()
     assert other.weight == pytest.approx(one.weight * factor, rel=1e-6)
+
+
+@given(st.integers(1, 200), st.integers(0, 2**32 - 1), st.booleans())
+def test_bounds_hold_every_finite_corner_and_little_more(count: int, seed: int, broken: bool) -> None:
+    corners = np.random.default_rng(seed).normal(size=(count, 3, 3)).astype(np.float32)
+    if broken:
+        corners[seed % count, seed % 3, 0] = (np.nan, np.inf, -np.inf)[seed % 3]
+    scene = Scene((quad("any", [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)]),), (Instance("any", 0, np.eye(4)),), ())
+    geometry = Geometry(scene, scene.first_frame())
+    geometry.corners = corners
+    bounds = make_bounds(geometry)
+    good = corners.reshape(-1, 3)[np.isfinite(corners).all(axis=2).ravel()].astype(np.float64)
+    size = np.linalg.norm(np.ptp(good, axis=0))
+    np.testing.assert_allclose(bounds.low, good.min(axis=0) - 1e-4 * size, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(bounds.high, good.max(axis=0) + 1e-4 * size, rtol=1e-9, atol=1e-12)

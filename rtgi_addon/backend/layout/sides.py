@@ -224,7 +224,8 @@ def _first_rays(setting: _Setting) -> _Rays:
 
 def _areas(geometry: Geometry, wanted: Bool) -> Float64:
     """(t,) m²; 0 for triangles not ``wanted`` (t,) and those without a normal, which no ray can leave or hit."""
-    rows = np.nonzero(wanted & geometry.normals.any(axis=1))[0]
+    rows = np.nonzero(wanted)[0]
+    rows = rows[geometry.normals[rows].any(axis=1)]
     corners = geometry.corners[rows].astype(np.float64)
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     of_rows = np.sqrt(np.einsum("ti,ti->t", cross, cross)) / 2
