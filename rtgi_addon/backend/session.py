@@ -280,8 +280,10 @@ class Session:
             return None
         placed = self._placed
         generators = caustics.find_generators(self.scene, placed.state, placed.geometry, placed.materials)
-        bounds = emission.grown_bounds(self._bounds, placed.geometry)
-        sources = caustics.caustic_sources(placed.state, placed.geometry, bounds, generators)
+        sources: list[emission.PhotonSource] = []
+        if len(generators.radius):
+            bounds = emission.grown_bounds(self._bounds, placed.geometry)
+            sources = caustics.caustic_sources(placed.state, placed.geometry, bounds, generators)
         counts = emission.photon_counts(sources, self.settings.photons)
         self._caustic_photons.follow(placed, change, sources, counts, stats)
         if not sources and self.settings.caustics is not Caustics.ON:
@@ -296,13 +298,13 @@ class Session:
         return outside + self._photons.irradiance(self._placed, Hits.BOUNCED)
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
-        end = self._finisher
+        end, stand_in = self._finisher, lit.light.stand_in
         return LightMaps(
             frame=lit.frame,
-            iim=end.to_pages(iim),
-            aim=end.to_pages(fill(lit.light.aim, lit.light.stand_in)),
-            caustics=None if caustic is None else end.to_pages(fill(caustic, lit.light.stand_in)),
-            valid=end.valid_pages(lit.light.stand_in == np.arange(self.texels.count)),
+            iim=end.to_pages(iim, stand_in),
+            aim=end.to_pages(fill(lit.light.aim, stand_in), stand_in),
+            caustics=None if caustic is None else end.to_pages(fill(caustic, stand_in), stand_in),
+            valid=end.valid_pages(stand_in == np.arange(self.texels.count)),
         )
 
 

@@ -21,9 +21,6 @@ from .components import SurfaceGraph
 from .gather import NO_TARGET, GatherRays, TracedTexels
 from .touched import Kept, touched_rays
 
-#: A texel of whose rays fewer than this share see lit sides is inside or under other geometry: not valid, filled from
-#: its neighbours. A side without a map is one that no light reaches; a surface that light reaches does not see it.
-LEAST_FREE_SHARE = 0.9
 #: Target, weight and pending mark of a link; a cosine ray's length besides.
 BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
 
@@ -59,7 +56,7 @@ class LinkStore:
         self.weight = np.zeros((self.kept, slots), np.float32)
         self._distance = np.zeros((self.kept, rays.n_cosine), np.float32)
         self.total: Float64 = np.zeros((count, 2))  # weight of each half
-        self.valid: Bool = np.ones(count, np.bool_)
+        self.free: Float32 = np.ones(count, np.float32)  # share of a texel's rays that end on no dark side
         self._cut: Bool = np.zeros(count, np.bool_)
         self._pending = np.ones((self.kept, slots), np.bool_)
         self._pending_texel = np.ones(count, np.bool_)
@@ -237,7 +234,7 @@ class LinkStore:
             of = texel[rows]
             traced = rays.trace(of)
             target, weight = self.rows(traced)
-            self.valid[of], self._cut[of] = traced.free >= LEAST_FREE_SHARE, traced.cut
+            self.free[of], self._cut[of] = traced.free, traced.cut
             self.total[of] = _totals(weight)
             inside = of < self.kept
             at = of[inside]

@@ -21,6 +21,7 @@ from ..surface.texels import stand_ins
 from .beyond_store import beyond_matrices
 from .gather import GatherRays
 from .link_store import LinkStore
+from .openness import open_texels
 from .products import row_products
 
 #: A half's rows are scaled up from the whole's by this at most; 2 is expected.
@@ -113,7 +114,7 @@ class Links:
 
 def make_links(store: LinkStore, rays: GatherRays, workers: Workers) -> Links:
     """The links of all texels as they stand in the frame of ``rays``."""
-    stand_in = stand_ins(rays.texels, store.valid)
+    stand_in = stand_ins(rays.texels, open_texels(rays.texels, store.free))
     others = np.arange(store.count, store.nothing + 1, dtype=np.int32)
     links = Links(
         stand_in=stand_in,

@@ -16,7 +16,7 @@ from ..scene import Atlas, Bool, Float32, Int32, Scene
 from ..settings import BakeSettings, Quality
 from ..surface.texels import Texels
 from .denoise import MapDenoiser
-from .dilate import DilationMap
+from .dilate import PADDING_PX, DilationMap
 from .oidn import Denoiser, OidnError, find_oidn
 from .seams import SeamMatcher
 
@@ -92,9 +92,15 @@ class Finisher:
         """``values`` (n, 3) matched along the cuts through smooth surfaces, or as they are when not asked for."""
         return values if self._seams is None else self._seams.match(values)
 
-    def to_pages(self, values: Float32) -> Float32:
-        """(pages, H, W, 3) pages of ``values`` (n, 3), with padding."""
-        return self._dilation.apply(values)
+    def to_pages(self, values: Float32, stand_in: Int32) -> Float32:
+        """(pages, H, W, 3) pages of ``values`` (n, 3), with padding; black where the ``stand_in`` (n,) is far away.
+
+        Light is carried under other geometry as far as lookups beside it reach, like padding. What lies deeper, or on
+        the far side of a wall that the surface goes through, is as dark as its rays find it.
+        """
+        away = np.maximum(*(np.abs(at.take(stand_in, mode="clip") - at) for at in (self._texels.row, self._texels.col)))
+        deep = (stand_in < 0) | (away > PADDING_PX)
+        return self._dilation.apply(np.where(deep[:, None], np.float32(0), values) if deep.any() else values)
 
     def valid_pages(self, valid: Bool) -> Bool:
         """(pages, H, W) pixels that are valid texels."""
