@@ -120,6 +120,8 @@ class BakeSettings:
 
     def __post_init__(self) -> None:
         for f in fields(self):
+            if isinstance(f.default, StrEnum):  # a word does as well
+                object.__setattr__(self, f.name, type(f.default)(getattr(self, f.name)))
             value, low, high = getattr(self, f.name), f.metadata["low"], f.metadata["high"]
             if value is not None and low is not None and not low <= value <= high:
                 raise ValueError(f"{f.name} = {value}: must lie in [{low}, {high}]")

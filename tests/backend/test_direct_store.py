@@ -315,12 +315,12 @@ def test_after_an_interrupted_update_nothing_is_kept(monkeypatch: pytest.MonkeyP
         raise Fault
 
     with monkeypatch.context() as patch:
-        patch.setattr(bake.tracer, "occluded", fail)
+        patch.setattr(bake.tracer, "blocked", fail)
         with pytest.raises(Fault):
             bake.moved(8, 0.1, 0.1, 0)
     assert bake.change().rays == bake.fresh_rays
     with monkeypatch.context() as patch:
-        patch.setattr(bake.tracer, "occluded", fail)
+        patch.setattr(bake.tracer, "blocked", fail)
         with pytest.raises(Fault):
             bake.moved(8, 0.1, 0.1, 0)
     assert not bake.lit_by().direct.any()

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from ..sampling import dot
 from ..scene import Bool, Float32, Int32
-from ..selection.sweep import CULL_MARGIN, END_MARGIN, Sweep, meets, touched_by
-from ..surface.tracing import Place
+from ..selection.sweep import END_MARGIN, Sweep, meets, touched_by
+from ..surface.tracing import CULL_MARGIN, Place
 from .gather import GatherRays
 
 

@@ -100,6 +100,8 @@ class AimedSource:
 def find_generators(scene: Scene, state: FrameState, geometry: Geometry, materials: Sequence[Material]) -> Generators:
     """One bounding sphere for each visible instance's specular triangles; one for all where there are too many."""
     specular = np.array([m.is_specular and m.opacity > 0 for m in materials], np.bool_)
+    if not specular.any():
+        return Generators(np.zeros((0, 3)), np.zeros(0))
     blocks = np.array([i.blocks_light for i in scene.instances], np.bool_) & state.visible
     usable = specular[geometry.material_of_triangle] & blocks[geometry.instance_of_triangle]
     rows = np.nonzero(usable & np.any(geometry.normals != 0, axis=1))[0]

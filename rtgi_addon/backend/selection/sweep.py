@@ -11,17 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..parallel import CHUNK_RAYS, Workers
-from ..sampling import dot
 from ..scene import Bool, Float32
 from ..surface.tracing import Place
 
 #: A segment that ends on an object is touched by it, whichever way its length was rounded.
 END_MARGIN = 1e-4
-#: Share by which the cull's spheres are taken wider: float32 loses that much of the distance between line and centre.
-CULL_MARGIN = 1e-4
 
 
 @dataclass(frozen=True)
@@ -68,7 +64,7 @@ def touched_by(places: tuple[Place, ...], origins: Float32, directions: Float32,
     """(n,) does the segment meet an object at any of ``places``?"""
     touched = np.zeros(len(origins), np.bool_)
     for place in places:
-        rows = near(place, origins, directions, distances)
+        rows = place.near(origins, directions, distances * np.float32(1 + END_MARGIN))
         rows = rows[~touched[rows]]
         if len(rows):
             touched[rows] = meets(place, origins[rows], directions[rows], distances[rows])
@@ -79,15 +75,3 @@ def meets(place: Place, origins: Float32, directions: Float32, distances: Float3
     """(n,) does the segment meet the object itself?"""
     ends = np.asarray(distances, np.float32) * np.float32(1 + END_MARGIN)
     return place.part.occluded(origins, directions, ends)
-
-
-def near(place: Place, origins: Float32, directions: Float32, distances: Float32) -> NDArray[np.int64]:
-    """(k,) segments that may meet the place's sphere."""
-    away = place.centre.astype(np.float32) - origins
-    along, length, apart = dot(away, directions), dot(directions, directions), dot(away, away)
-    radius = np.float32(place.radius)
-    inside = apart <= radius * radius
-    # Squared distance of the line from the centre, times the direction's squared length.
-    beside = apart * length - along * along <= (radius * radius + CULL_MARGIN * apart) * length
-    reached = along - radius * np.sqrt(length) <= distances * length * np.float32(1 + END_MARGIN)
-    return np.nonzero(inside | (beside & reached & (along > 0)))[0]
