@@ -42,7 +42,7 @@ test-all: lint test-4.2 test-4.5 test-5.2 test ## lint and every version
 lint: setup ## ruff, and mypy --strict on the backend
 	@$(PY) -m ruff check . && $(PY) -m ruff format --check . && $(PY) -m mypy
 
-bench: setup ## speed against error, beside Cycles; writes docs/benchmarks.md
+bench: setup ## speed against error beside Cycles, frames, scaling; writes docs/benchmarks.md
 	@$(PY) -m bench </dev/null
 
 wheels: setup
