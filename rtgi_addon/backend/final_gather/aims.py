@@ -74,11 +74,18 @@ def follow_aims(
 
 
 def target_density(bright: BrightTargets, area: Float32, sky: Sky | None) -> Float32:
-    """(r, m) of aimed samples on each target: probability per m² of a texel, per sr of a patch of sky."""
+    """(r, m) of aimed samples on each target: probability per m² of a texel, per sr of a patch of sky.
+
+    Nothing is aimed at a sky that no guide state has.
+    """
     count = len(area)
-    solid_angle = np.float32(1) if sky is None else sky.solid_angle
     on_texels = density_on_texels(bright.probability[:, :count], area)
-    return np.asarray(np.concatenate([on_texels, bright.probability[:, count:] / solid_angle], axis=1), np.float32)
+    if sky is None:
+        return on_texels
+    on_sky = np.zeros((len(on_texels), sky.count), np.float32)
+    if bright.probability.shape[1] > count:
+        on_sky[:] = bright.probability[:, count:] / sky.solid_angle
+    return np.concatenate([on_texels, on_sky], axis=1)
 
 
 def density_on_texels(probability: Float32, area: Float32) -> Float32:

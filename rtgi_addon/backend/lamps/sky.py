@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import Float32, Int32, World
+from ..scene import Float32, Float64, Int32, World
 
 #: Finer maps are averaged down to at most this many rows: 0.7° a patch, finer than a soft shadow in a light map.
 MOST_ROWS = 256
@@ -55,8 +55,8 @@ class Sky:
 def make_sky(world: World | None, layout: tuple[int, int] | None = None) -> Sky | None:
     """The patches of ``world``; None for no world or a black one.
 
-    ``layout`` (rows, columns) is that of other frames: a world of one colour takes it, and none at all is black patches
-    of it, so that what was linked to the sky stays so.
+    ``layout`` (rows, columns) is that of other frames. Any world takes it, and none at all is black patches of it: what
+    is linked to the sky stays so, and gather rays are aimed at the same patches in all frames.
     """
     dark = world is None or world.is_black
     if dark and layout is None:
@@ -64,11 +64,10 @@ def make_sky(world: World | None, layout: tuple[int, int] | None = None) -> Sky 
     radiance = np.zeros((1, 1, 3), np.float32)
     if world is not None and not dark:
         radiance = _shrunk(np.asarray(world.radiance, np.float32))
-    if layout is not None and radiance.shape[:2] == (1, 1):
-        radiance = np.broadcast_to(radiance, (*layout, 3))
+    if layout is not None and radiance.shape[:2] != layout:
+        radiance = _fitted(radiance, *layout)
     rows, columns = radiance.shape[:2]
-    edges = np.sin(np.pi * (np.arange(rows + 1) / rows - 0.5))
-    solid = np.repeat(np.diff(edges) * (2 * np.pi / columns), columns)
+    solid = np.repeat(np.diff(_heights(rows)) * (2 * np.pi / columns), columns)
     return Sky(rows, columns, radiance.reshape(-1, 3), solid.astype(np.float32))
 
 
@@ -87,3 +86,27 @@ def _shrunk(image: Float32) -> Float32:
             return image
     height, width = image.shape[0] // factor, image.shape[1] // factor
     return np.asarray(image.reshape(height, factor, width, factor, 3).mean(axis=(1, 3)), np.float32)
+
+
+def _heights(rows: int) -> Float64:
+    """(rows + 1,) sines of the elevations between rows; equal steps of it are equal solid angles."""
+    return np.asarray(np.sin(np.pi * (np.arange(rows + 1) / rows - 0.5)))
+
+
+def _fitted(image: Float32, rows: int, columns: int) -> Float32:
+    """``image`` as (rows, columns, 3), averaged by solid angle: what all of the sky sends is kept."""
+    if image.shape[:2] == (1, 1):
+        return np.broadcast_to(image, (rows, columns, 3))
+    by_row = _averaged(image.astype(np.float64), _heights(image.shape[0]), _heights(rows))
+    across = np.linspace(0, 1, image.shape[1] + 1), np.linspace(0, 1, columns + 1)
+    return np.asarray(_averaged(by_row.swapaxes(0, 1), *across).swapaxes(0, 1), np.float32)
+
+
+def _averaged(values: Float64, edges: Float64, wanted: Float64) -> Float64:
+    """(w, ...) means between the ``wanted`` (w + 1,) of what is ``values`` (v, ...) between the ``edges`` (v + 1,)."""
+    shape = (-1, *[1] * (values.ndim - 1))
+    total = np.zeros((len(edges), *values.shape[1:]))
+    np.cumsum(values * np.diff(edges).reshape(shape), axis=0, out=total[1:])
+    at = np.clip(np.searchsorted(edges, wanted, side="right") - 1, 0, len(values) - 1)
+    reached = total[at] + values[at] * (wanted - edges[at]).reshape(shape)
+    return np.asarray(np.maximum(np.diff(reached, axis=0) / np.diff(wanted).reshape(shape), 0))
