@@ -54,6 +54,36 @@ def test_transformed_quad_is_hit_where_its_plane_says(linear, moving):
         assert hit.back[0] == (side < 0)
 
 
+@given(
+    away=st.tuples(*[st.floats(-5e3, 5e3)] * 3),
+    turn=st.floats(0, 6),
+    lift=st.floats(1e-5, 1e-3),
+    seed=st.integers(0, 99),
+)
+@settings(max_examples=30, deadline=None)
+def test_a_mover_far_from_its_own_origin_is_hit_as_finely_as_any(away, turn, lift, seed):
+    """Mesh kilometres from the pivot it turns about, the object beside the scene's origin: rays that start 10 µm above
+    it and leave do not meet it, and those that come down do."""
+    matrix = np.eye(4)
+    c, s = np.cos(turn), np.sin(turn)
+    matrix[:3, :3] = [[c, -s, 0], [s, c, 0], [0, 0, 1]]
+    matrix[:3, 3] = -matrix[:3, :3] @ np.array(away)
+    moved = replace(UNIT_QUAD, vertices=(UNIT_QUAD.vertices.astype(np.float64) + away).astype(np.float32))
+    scene = Scene((moved,), (Instance("q", 0, matrix, moving=True),), (scenes.WHITE,))
+    geometry = Geometry(scene, scene.first_frame())
+    tracer = EmbreeTracer(scene, geometry, scene.first_frame(), Workers(1))
+    rng = np.random.default_rng(seed)
+    n = geometry.normals[rng.integers(0, 2, 200)]
+    weights = rng.dirichlet([2, 2, 2], 200)
+    start = (np.einsum("nk,nkj->nj", weights, geometry.corners[rng.integers(0, 2, 200)]) + n * lift).astype(np.float32)
+    outward = (rng.normal(size=(200, 3)) * 0.3 + n).astype(np.float32)
+    up = (outward * n).sum(axis=1) > 0.05
+    assert not tracer.occluded(start[up], outward[up], np.full(up.sum(), np.inf, np.float32)).any()
+    down = tracer.intersect(start, -n)
+    assert (down.triangle >= 0).all()
+    np.testing.assert_allclose(down.distance, lift, atol=2e-6)
+
+
 def test_mover_and_still_instance_agree():
     """A rigid mover, traced in its own space, gives the hits of the same object built into the still scene."""
     matrix = scenes.translation(0.3, -0.2, 0.5)

@@ -9,7 +9,7 @@ tested, which is how the swept test finds what it uncovers.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 import numpy as np
@@ -72,7 +72,8 @@ class Part:
 
     embree: Any
     triangle_of_primitive: Int32  # scene-wide
-    to_object: Float64 | None = None  # (3, 4) from local to the mover's object space; None: rays are taken as they are
+    to_object: Float64 | None = None  # (3, 4) from local to the mover's own space; None: rays are taken as they are
+    centre: Float64 | None = None  # (3,) in the mover's object space: the origin of its own space
 
     def rays(self, origins: Float32, directions: Float32) -> tuple[Float32, Float32]:
         """Rays in the part's own space; a direction keeps its parametrisation, so distances stay comparable."""
@@ -202,15 +203,17 @@ class EmbreeTracer:
         matrix = self._geometry.matrix_world[index]
         inverse = np.linalg.pinv(matrix[:3, :3])  # a flat transform still gets an answer
         shift = inverse @ (self._geometry.origin - matrix[:3, 3])
-        to_object = np.concatenate([inverse, shift[:, None]], axis=1)
         rows = self._geometry.triangles_of(index)
         if before is not None and not self._scene.instances[index].deforming:
-            part = Part(before.part.embree, before.part.triangle_of_primitive, to_object)
+            part = before.part
         else:
             mesh_index = self._scene.instances[index].mesh
             mesh = self._scene.meshes[mesh_index]
-            vertices = state.vertices.get(mesh_index, mesh.vertices)
-            part = _part(vertices[mesh.triangles], np.arange(rows.start, rows.stop), to_object)
+            corners = state.vertices.get(mesh_index, mesh.vertices)[mesh.triangles]
+            # Float32 is finest about the middle; a mesh may lie a kilometre from its object's origin.
+            centre = _middle(_finite(corners))
+            part = replace(_part(corners - centre, np.arange(rows.start, rows.stop)), centre=centre)
+        part = replace(part, to_object=np.concatenate([inverse, (shift - part.centre)[:, None]], axis=1))
         return Place(index, part, *_sphere(self._geometry.corners[rows], self._geometry))
 
     def _intersect(self, origins: Float32, directions: Float32) -> Hits:
@@ -252,20 +255,30 @@ class EmbreeTracer:
         return blocked
 
 
-def _part(corners: Float32, rows: Any, to_object: Float64 | None = None) -> Part:
+def _part(corners: Float32 | Float64, rows: Any) -> Part:
     embree = EmbreeScene()
     # Embree ignores a triangle with a non-finite corner; a degenerate one is never hit.
     TriangleMesh(embree, np.ascontiguousarray(corners, np.float32))
-    return Part(embree, rows.astype(np.int32), to_object)
+    return Part(embree, rows.astype(np.int32))
+
+
+def _middle(points: Float64) -> Float64:
+    """(3,) of the bounding box of ``points`` (p, 3); zeros without any."""
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else np.zeros(3))
+
+
+def _finite(corners: Float32) -> Float64:
+    """(p, 3) the finite ones of ``corners`` (t, 3, 3)."""
+    points = corners.reshape(-1, 3).astype(np.float64)
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def _sphere(corners: Float32, geometry: Geometry) -> tuple[Float64, float]:
     """((3,), m) a sphere around the finite ones of ``corners`` (t, 3, 3), wider by more than rays are lifted."""
-    points = corners.reshape(-1, 3).astype(np.float64)
-    points = points[np.isfinite(points).all(axis=1)]
+    points = _finite(corners)
     if not len(points):
         return np.zeros(3), 0.0
-    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    centre = _middle(points)
     radius = float(np.sqrt(((points - centre) ** 2).sum(axis=1).max()))
     return centre, radius * (1 + 1e-4) + 4 * float(geometry.offset_length(_float32(centre[None]) + radius)[0])
 
