@@ -11,7 +11,7 @@ from typing import TypeVar
 R = TypeVar("R")
 
 #: Rays worked on at a time: 64k rays with their hits stay in a core's cache (measured, DESIGN §6).
-CHUNK_RAYS = 1 << 16
+CHUNK_RAYS = 1 << 17
 
 
 def thread_count(threads: int) -> int:

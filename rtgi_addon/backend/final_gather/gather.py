@@ -87,6 +87,7 @@ class TracedTexels:
     target: Int32  # (m, K)
     weight: Float32  # (m, K)
     usable: Bool  # (m, K) False: the ray starts inside geometry, or leaves below the surface
+    opened: Bool  # (m, POINTS) False: the point lies inside geometry
     distance: Float32  # (m, cosine) inf where a ray escaped
     cut: Bool  # (m,) some ray ended on a dark side: another surface may cut through the texel
     free: Float32  # (m,) share of the cosine rays from the texel's open part that do not end on a dark side
@@ -106,7 +107,7 @@ class GatherRays:
         self.n_cosine, self.n_bright = samples.cosine, samples.bright if bright.any else 0
         self._tracer, self._surfaces, self._sky = tracer, surfaces, sky
         self._max_specular, self._seed = max_specular, seed
-        self._see_through = bool(surfaces.passes.any())
+        self.see_through = bool(surfaces.passes.any())
         self._bright, self._density = bright, target_density(bright, frame.area, sky)
         self._first_density = bright.room * np.int32(self.target_count)  # (n,) of each texel's room
         tangent, bitangent = frames(frame.normal)
@@ -124,7 +125,7 @@ class GatherRays:
 
         The same bits as a new one would have. The sky must have the patches it had.
         """
-        self._surfaces, self._see_through = surfaces, bool(surfaces.passes.any())
+        self._surfaces, self.see_through = surfaces, bool(surfaces.passes.any())
         rows = np.nonzero(moved)[0]
         if not len(rows):
             return
@@ -158,7 +159,15 @@ class GatherRays:
         beyond = self.beyond(*_all_rays(texel, self.n_cosine), fan)
         distance = fan.hits.distance.reshape(count, -1)
         return TracedTexels(
-            target, weight, usable, distance, dark.any(axis=1), free.astype(np.float32), beyond, rays + beyond.rays
+            target,
+            weight,
+            usable,
+            opened,
+            distance,
+            dark.any(axis=1),
+            free.astype(np.float32),
+            beyond,
+            rays + beyond.rays,
         )
 
     def cosine_segments(self, texel: Int32, number: Int32) -> tuple[Int32, Float32, Float32]:
@@ -178,7 +187,7 @@ class GatherRays:
         escaped = hits.triangle < 0
         target = self._targets(hits, directions)
         dark = (target < 0) & ~escaped
-        if self._see_through:
+        if self.see_through:
             dark &= ~self._goes_on(hits.triangle)
         weight = np.full(len(texel), 1 / np.float32(self.n_cosine), np.float32)
         if self.n_bright:
@@ -239,7 +248,7 @@ class GatherRays:
         kept: list[tuple[NDArray[Any], ...]] = []
         segments: list[tuple[NDArray[Any], ...]] = []
         on = np.zeros(0, np.int64)
-        if self._see_through and self._max_specular > 0:
+        if self.see_through and self._max_specular > 0:
             on = np.nonzero(self._goes_on(fan.hits.triangle))[0]
         ray = texel[on].astype(np.int64) * self.n_cosine + number[on]
         hits, target, directions = fan.hits.take(on), fan.target[on], fan.direction[on]

@@ -174,7 +174,7 @@ class Lighting:
         before = kept.inputs
         if before is not None and before.links is links and before.emitted is emitted and before.outside is outside:
             return before.other
-        return outside + links.irradiance(emitted) if emitted.any() else outside
+        return np.ascontiguousarray(outside + links.irradiance(emitted)) if emitted.any() else outside
 
     def _solved(self, now: _Inputs, before: Light | None, texels: NDArray[np.int64], group: Int32) -> Light:
         """The light of ``texels`` (r,) anew, all else as ``before``."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..parallel import CHUNK_RAYS, Workers
 from ..scene import Bool, Float32, Float64, Int32
 from ..selection.sweep import Sweep
+from ..surface.rasterise import POINTS
 from .beyond_store import BeyondStore
 from .components import SurfaceGraph
 from .gather import NO_TARGET, GatherRays, TracedTexels
@@ -25,8 +26,9 @@ from .touched import Kept, touched_rays
 BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
 
 
-#: Pieces that work is cut into, at the least: enough for the threads of most machines, few enough to stay large.
-PARTS = 8
+#: Pieces that work is cut into, at the least. More and smaller ones would keep more threads busy, but NumPy's threads
+#: stand in one another's way below some ten thousand numbers at a time.
+PARTS = 2
 
 
 @dataclass
@@ -58,6 +60,7 @@ class LinkStore:
         self.total: Float64 = np.zeros((count, 2))  # weight of each half
         self.free: Float32 = np.ones(count, np.float32)  # share of a texel's rays that end on no dark side
         self._cut: Bool = np.zeros(count, np.bool_)
+        self._opened: Bool = np.ones((count, POINTS), np.bool_)
         self._pending = np.ones((self.kept, slots), np.bool_)
         self._pending_texel = np.ones(count, np.bool_)
         self._filled = False  # is anything traced yet?
@@ -98,27 +101,24 @@ class LinkStore:
         self._pending_texel[self.kept :] = True
         moved = sweep.moved[rays.texels.instance]
         whole = moved | self._cut_near(rays, sweep, reach)
-        texel = np.nonzero(~(whole[: self.kept] | self._pending.all(axis=1)))[0].astype(np.int32)
-
+        skipped = whole[: self.kept] | self._pending.all(axis=1)
         moved_column = np.append(moved, np.zeros(self.nothing + 1 - self.count, np.bool_))
 
         def part(rows: slice) -> int:
-            of = texel[rows]
-            found = touched_rays(rays, sweep, of, self._known(of, moved_column), reach)
-            mark = np.empty((len(of), self.target.shape[1]), np.bool_)
+            texel = np.arange(rows.start, rows.stop, dtype=np.int32)
+            found = touched_rays(rays, sweep, texel, self._known(rows, ~skipped[rows], moved_column), reach)
+            mark = np.empty((len(texel), self.target.shape[1]), np.bool_)
             mark[:, self._cosine_slots], mark[:, self._aimed_slots] = found.cosine, found.aimed
-            self._pending[of] |= mark
+            self._pending[rows] |= mark
+            self._pending_texel[rows] |= mark.any(axis=1)
             return found.tested
 
-        tested = sum(self._workers.map_slices(part, len(texel), self.chunk_of(len(texel))))
+        tested = sum(self._workers.map_slices(part, self.kept, _even(self.kept, 4 * self.chunk)))
         of, number = self.beyond.touched(sweep)
         self._pending[of, self._cosine_slots[number]] = True
-        touched = self._pending[texel].any(axis=1) if len(texel) else np.zeros(0, np.bool_)
-        # Which part of a texel that is cut through is open hangs on all its rays.
-        whole[texel[touched & self._cut[texel]]] = True
+        self._pending_texel[of] = True
         self._pending[whole[: self.kept]] = True
         self._pending_texel |= whole
-        self._pending_texel[texel[touched]] = True
         return tested
 
     def at_stake(self, brightness: Float32, texel: Int32) -> Float32:
@@ -151,13 +151,13 @@ class LinkStore:
         self._pending_texel[texel] = False
         return work
 
-    def _known(self, texel: Int32, moved_column: Bool) -> Kept:
-        """What is stored of the rays of ``texel`` (m,); ``moved_column`` (m + 1,): targets that moved."""
-        target = self.target.take(texel, axis=0)
+    def _known(self, rows: slice, asked: Bool, moved_column: Bool) -> Kept:
+        """What is stored of the rays of some texels; ``moved_column`` (m + 1,): targets that moved."""
+        target, distance = self.target[rows], self._distance[rows]
         hit, aim = target.take(self._cosine_slots, axis=1), target.take(self._aimed_slots, axis=1)
-        distance = self._distance.take(texel, axis=0)
-        seen = self.weight.take(texel, axis=0).take(self._aimed_slots, axis=1) > 0
+        seen = self.weight[rows].take(self._aimed_slots, axis=1) > 0
         return Kept(
+            asked=asked,
             hits_moved=moved_column.take(hit),
             hits_unknown=(hit == self.nothing) & np.isfinite(distance),
             distance=distance,
@@ -176,7 +176,7 @@ class LinkStore:
         return near
 
     def _renew_rays(self, rays: GatherRays, texel: Int32, work: LinkWork) -> Int32:
-        """Trace the pending links of ``texel``, whose others stay; texels that turned out to be cut through."""
+        """Trace the pending links of ``texel``, whose others stay; texels of which another part may be open now."""
         if not len(texel):
             return texel
         pending = self._pending[texel]
@@ -191,12 +191,17 @@ class LinkStore:
             t, k = of[rows], number[rows]
             fan = rays.cosine(t, k)
             slot = self._cosine_slots[k]
+            before = (self.target[t, slot] == self.nothing) & np.isfinite(self._distance[t, k])
+            unknown = (fan.target == NO_TARGET) & np.isfinite(fan.hits.distance)
             self.target[t, slot] = self._column(fan.target)
-            self.weight[t, slot] = np.where(fan.dark | fan.below, np.float32(0), fan.weight)
+            usable = self._opened[t, fan.start] & ~(fan.dark | fan.below)
+            self.weight[t, slot] = np.where(usable, fan.weight, np.float32(0))
             self._distance[t, k] = fan.hits.distance
             found = rays.beyond(t, k, fan)
             beyond.append((rows.start, found))
-            return len(t) + found.rays, t[fan.dark]
+            # Which part of a texel is open hangs on which rays end on dark sides.
+            other = (before | unknown) if rays.see_through else before != unknown
+            return len(t) + found.rays, t[other]
 
         done = self._workers.map_slices(cosine, len(of), _even(len(of), CHUNK_RAYS))
         work.traced += sum(d[0] for d in done)
@@ -216,7 +221,8 @@ class LinkStore:
             t, k = of[rows], number[rows]
             found = rays.aimed(t, k)
             slot = self._aimed_slots[k]
-            self.target[t, slot], self.weight[t, slot] = self._column(found.target), found.weight
+            self.target[t, slot] = self._column(found.target)
+            self.weight[t, slot] = np.where(self._opened[t, found.start], found.weight, np.float32(0))
             return found.cast
 
         return sum(self._workers.map_slices(aimed, len(of), _even(len(of), CHUNK_RAYS)))
@@ -234,7 +240,7 @@ class LinkStore:
             of = texel[rows]
             traced = rays.trace(of)
             target, weight = self.rows(traced)
-            self.free[of], self._cut[of] = traced.free, traced.cut
+            self.free[of], self._cut[of], self._opened[of] = traced.free, traced.cut, traced.opened
             self.total[of] = _totals(weight)
             inside = of < self.kept
             at = of[inside]
@@ -280,9 +286,9 @@ class LinkStore:
 
 
 def _even(total: int, most: int) -> int:
-    """Items worked on at a time, at most ``most``, so that there are PARTS pieces of work or more. No result hangs on
-    it."""
-    return max(1, min(most, -(-total // PARTS)))
+    """Items worked on at a time, at most ``most``, so that PARTS threads have as much to do. No result hangs on it."""
+    rounds = -(-total // (most * PARTS))
+    return max(1, -(-total // max(rounds * PARTS, 1)))
 
 
 def _totals(weight: Float32) -> Float64:

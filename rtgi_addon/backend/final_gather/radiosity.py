@@ -27,11 +27,13 @@ def solve(links: Links, texels: NDArray[np.int64], group: Int32, b: Float32, alb
     links of those texels to all ``targets`` · group (r,): texels that exchange light have one number, those that
     exchange none -1; no group may be cut · b (r, 3): irradiance by other ways than from texels · albedo (r, 3).
     """
-    radiosity = np.zeros((targets, 3), np.float32)
+    columns, share = np.zeros((3, targets), np.float32), np.ascontiguousarray(albedo.T)
+    everything = len(texels) and texels[0] == 0 and texels[-1] == len(texels) - 1
+    where: slice | NDArray[np.int64] = slice(0, len(texels)) if everything else texels
 
     def bounce(x: Float32) -> Float32:
-        radiosity[texels] = albedo * x
-        return links.irradiance(radiosity)
+        columns[:, where] = share * x.T
+        return links.irradiance(columns.T)
 
     solution = solve_fixed_point(bounce, b, group=group, tolerance=TOLERANCE, max_products=MOST_PRODUCTS)
     return np.maximum(solution.x, 0).astype(np.float32)

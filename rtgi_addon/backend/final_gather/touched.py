@@ -21,8 +21,9 @@ from .gather import GatherRays
 
 @dataclass(frozen=True)
 class Kept:
-    """What is stored of the rays of m texels, none of which moved."""
+    """What is stored of the rays of m texels."""
 
+    asked: Bool  # (m,) False: the texel itself moved, or needs no test
     hits_moved: Bool  # (m, cosine) the ray ended on an instance that moved
     hits_unknown: Bool  # (m, cosine) it ended on a side that no texel tells of
     distance: Float32  # (m, cosine) m, inf where it escaped
@@ -40,25 +41,26 @@ class Touched:
 
 
 def touched_rays(rays: GatherRays, sweep: Sweep, texel: Int32, kept: Kept, reach: Float32) -> Touched:
-    """The rays of ``texel`` (m,); reach (n,) of all texels' points from their middle.
+    """The rays of those of ``texel`` (m,) that are asked for; reach (n,) of all texels' points from their middle.
 
     A ray that met an object where it was ended on it, and an aim in sight had nothing before it; so the places left
     matter only for what is not known. Samples that aim at what moved count as touched, whether they meet it or not.
     """
-    cosine = kept.hits_moved.copy()
+    asked = kept.asked[:, None]
+    cosine = kept.hits_moved & asked
     aimed = np.zeros(kept.seen.shape, np.bool_)
-    at, of, number = _chosen(kept.hits_unknown & ~cosine, texel)
+    at, of, number = _chosen(kept.hits_unknown & asked & ~cosine, texel)
     _, origins, directions = rays.cosine_segments(of, number)
     cosine.reshape(-1)[at] = touched_by(sweep.left, origins, directions, kept.distance.reshape(-1)[at])
     tested = len(at)
     if rays.aims is not None:
-        aimed |= _aimed_at_moved(rays, sweep, texel)
-        at, of, number = _chosen(kept.hidden & ~aimed, texel)
+        aimed |= _aimed_at_moved(rays, sweep, texel) & asked
+        at, of, number = _chosen(kept.hidden & asked & ~aimed, texel)
         aim, _, origins, ways = rays.aimed_segments(of, number)
         aimed.reshape(-1)[at] = touched_by(sweep.left, origins, ways, _ends(rays, aim))
         tested += len(at)
     for place in sweep.taken:
-        view = _view(rays, place, texel, reach)
+        view = _view(rays, place, texel, kept.asked, reach)
         at, of, number = _chosen(_cosine_near(rays, view, texel, kept.distance) & ~cosine, texel)
         _, origins, directions = rays.cosine_segments(of, number)
         cosine.reshape(-1)[at] = meets(place, origins, directions, kept.distance.reshape(-1)[at])
@@ -93,10 +95,11 @@ class _View:
     radius: Float32  # (k,) of the sphere that a ray from the texel's middle must meet
 
 
-def _view(rays: GatherRays, place: Place, texel: Int32, reach: Float32) -> _View:
+def _view(rays: GatherRays, place: Place, texel: Int32, asked: Bool, reach: Float32) -> _View:
     away = place.centre.astype(np.float32) - rays.frame.position.take(texel, axis=0)
     radius = np.float32(place.radius) + reach.take(texel)
-    row = np.nonzero(dot(away, rays.frame.normal.take(texel, axis=0)) >= -radius)[0].astype(np.int32)
+    above = dot(away, rays.frame.normal.take(texel, axis=0)) >= -radius
+    row = np.flatnonzero(above & asked).astype(np.int32)
     away, radius = away[row], radius[row]
     return _View(row, (away[:, 0], away[:, 1], away[:, 2]), dot(away, away), radius)
 

@@ -151,7 +151,9 @@ def lamp_irradiance(
     def part(rows: slice) -> LampLight:
         return _sampled(light, number, texels[rows], receivers, shadows, seed)
 
-    done = workers.map_slices(part, len(texels), max(1, CHUNK_RAYS // receivers.samples))
+    # Few texels are still cut in two, for two threads.
+    chunk = min(max(1, CHUNK_RAYS // receivers.samples), max(256, -(-len(texels) // 2)))
+    done = workers.map_slices(part, len(texels), chunk)
     if not done:
         return LampLight(np.zeros(0, np.float32), np.zeros(0, np.bool_), 0)
     strength, walled = np.concatenate([d.strength for d in done]), np.concatenate([d.walled for d in done])
