@@ -100,20 +100,21 @@ class Session:
         self._bounds = emission.make_bounds(self._placed.geometry)
         self._sides = sending_sides(scene, atlas)
         self._direct_store = DirectStore()
-        self._photons = self._photon_light(live, diffuse=True)
-        self._caustic_photons = self._photon_light(live, diffuse=False)
+        self._photons = self._photon_light(diffuse=True)
+        self._caustic_photons = self._photon_light(diffuse=False)
+        self._live = live
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
         self._broken = False  # a frame was cut short: what is kept may be of two frames
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
         self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers, live)
 
-    def _photon_light(self, live: LiveSettings | None, *, diffuse: bool) -> PhotonLight:
+    def _photon_light(self, *, diffuse: bool) -> PhotonLight:
         most = self.settings.max_bounces if diffuse else self.settings.max_specular + 1
         store = PhotonStore(
             self.texels, selection=self.settings.selection, max_bounces=most, seed=self.settings.seed, diffuse=diffuse
         )
-        return PhotonLight(store, nearest=self.settings.nearest_photons, live=live)
+        return PhotonLight(store, nearest=self.settings.nearest_photons)
 
     @property
     def texels(self) -> Texels:
@@ -168,6 +169,9 @@ class Session:
         stats.estimated_error = lit.estimated_error
         stats.warnings += self._finisher.warnings
         self._broken = False
+        if self._live is not None:  # guide and first frame are lit whole
+            self._photons.limit(self._live)
+            self._caustic_photons.limit(self._live)
         return FrameResult(maps, stats)
 
     def _forget(self) -> None:
@@ -231,6 +235,9 @@ class Session:
         seen = SurfaceGraph(self.texels.surface_count)
         for state in reversed(states):
             change = placed.follow(state)
+            if self.settings.selection is Selection.PROBE:  # what is aimed at must not hang on what probes have found
+                self._photons.forget()
+                self._caustic_photons.forget()
             setup.rays += look_around(placed, seen, self.settings.seed)
             outside, _ = self._outside(change, setup)
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)

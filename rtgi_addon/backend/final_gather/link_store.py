@@ -29,6 +29,8 @@ BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
 #: Pieces that work is cut into, at the least. More and smaller ones would keep more threads busy, but NumPy's threads
 #: stand in one another's way below some ten thousand numbers at a time.
 PARTS = 2
+#: Fewer rays than this are not worth a second thread.
+LEAST_RAYS = 1 << 12
 
 
 @dataclass
@@ -113,7 +115,7 @@ class LinkStore:
             self._pending_texel[rows] |= mark.any(axis=1)
             return found.tested
 
-        tested = sum(self._workers.map_slices(part, self.kept, _even(self.kept, 4 * self.chunk)))
+        tested = sum(self._workers.map_slices(part, self.kept, _even(self.kept, 4 * self.chunk, self._least)))
         of, number = self.beyond.touched(sweep)
         self._pending[of, self._cosine_slots[number]] = True
         self._pending_texel[of] = True
@@ -203,7 +205,7 @@ class LinkStore:
             other = (before | unknown) if rays.see_through else before != unknown
             return len(t) + found.rays, t[other]
 
-        done = self._workers.map_slices(cosine, len(of), _even(len(of), CHUNK_RAYS))
+        done = self._workers.map_slices(cosine, len(of), _even(len(of), CHUNK_RAYS, LEAST_RAYS))
         work.traced += sum(d[0] for d in done)
         work.renewed += int(np.count_nonzero(pending))
         self.beyond.replace_rays(of, number, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
@@ -225,7 +227,7 @@ class LinkStore:
             self.weight[t, slot] = np.where(self._opened[t, found.start], found.weight, np.float32(0))
             return found.cast
 
-        return sum(self._workers.map_slices(aimed, len(of), _even(len(of), CHUNK_RAYS)))
+        return sum(self._workers.map_slices(aimed, len(of), _even(len(of), CHUNK_RAYS, LEAST_RAYS)))
 
     def _renew_texels(self, rays: GatherRays, texel: Int32, work: LinkWork) -> None:
         """Trace all links of ``texel``."""
@@ -270,9 +272,13 @@ class LinkStore:
         """Texels worked on at a time."""
         return max(1, CHUNK_RAYS // self.target.shape[1])
 
+    @property
+    def _least(self) -> int:
+        return max(1, LEAST_RAYS // self.target.shape[1])
+
     def chunk_of(self, texels: int) -> int:
         """:attr:`chunk`, or less where that would leave threads without work."""
-        return _even(texels, self.chunk)
+        return _even(texels, self.chunk, self._least)
 
     def _column(self, target: Int32) -> Int32:
         return np.where(target == NO_TARGET, np.int32(self.nothing), target)
@@ -285,10 +291,13 @@ class LinkStore:
         return row, np.where(self.weight[at] > 0, target, np.int32(-1))
 
 
-def _even(total: int, most: int) -> int:
-    """Items worked on at a time, at most ``most``, so that PARTS threads have as much to do. No result hangs on it."""
+def _even(total: int, most: int, least: int) -> int:
+    """Items worked on at a time, so that PARTS threads have as much to do, but ``least`` at least and ``most`` at most.
+
+    No result hangs on it.
+    """
     rounds = -(-total // (most * PARTS))
-    return max(1, -(-total // max(rounds * PARTS, 1)))
+    return max(least, -(-total // max(rounds * PARTS, 1)))
 
 
 def _totals(weight: Float32) -> Float64:

@@ -39,14 +39,19 @@ _CHOOSE: dict[Hits, Callable[[PhotonPaths], Bool]] = {
 class PhotonLight:
     """A store of photons and the maps made from it. A map's bits do not depend on when its surfaces were computed."""
 
-    def __init__(self, store: PhotonStore, *, nearest: int, live: LiveSettings | None = None) -> None:
-        """Maps look for the ``nearest`` photons of each texel. ``live``: frames after the first have a budget."""
+    def __init__(self, store: PhotonStore, *, nearest: int) -> None:
+        """Maps look for the ``nearest`` photons of each texel."""
         self.store = store
-        self._nearest, self._live = nearest, live
+        self._nearest = nearest
+        self._live: LiveSettings | None = None
         self._schedules: dict[Hits, UpdateSchedule] = {}
         self._maps: dict[Hits, Float32] = {}
         self._stale: dict[Hits, Bool] = {}
         self._lost = False
+
+    def limit(self, live: LiveSettings) -> None:
+        """From the next frame on do no more in one than its budget allows."""
+        self._live = live
 
     def forget(self) -> None:
         """Rely on no photon: the next frame traces all."""
