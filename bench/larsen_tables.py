@@ -15,9 +15,9 @@ from rtgi_addon.backend.final_gather.gather import GatherRays
 from rtgi_addon.backend.final_gather.radiosity import sent_by_targets
 from rtgi_addon.backend.parallel import CHUNK_RAYS, Workers
 from rtgi_addon.backend.photon.photon_map import PhotonMap, photon_irradiance
-from rtgi_addon.backend.photon.scatter import diffuse_shares
 from rtgi_addon.backend.scene import Float32, Instance, Int32, Scene
 from rtgi_addon.backend.settings import SampleCounts
+from rtgi_addon.backend.surface.scatter import diffuse_shares
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import WHITE, grid_atlas, point_light, quad
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from .lamps.sky import Sky, make_sky, sky_layout
 from .parallel import Workers
-from .photon.scatter import Surfaces, diffuse_shares, make_surfaces
 from .scene import Atlas, Bool, Float32, FrameState, Material, Scene
 from .selection.changes import Change
 from .selection.sweep import Sweep
 from .surface.geometry import Geometry
+from .surface.scatter import Surfaces, diffuse_shares, make_surfaces
 from .surface.texels import TexelFrame, follow_texels, make_texels, place_texels, texel_colours
 from .surface.tracing import EmbreeTracer
 

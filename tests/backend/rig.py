@@ -13,9 +13,9 @@ from rtgi_addon.backend.lamps.lights import Bounds
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.photon.paths import EnergyBook, PhotonPaths
 from rtgi_addon.backend.photon.photons import trace_photons
-from rtgi_addon.backend.photon.scatter import Surfaces, make_surfaces
 from rtgi_addon.backend.scene import Atlas, FrameState, Scene
 from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.scatter import Surfaces, make_surfaces
 from rtgi_addon.backend.surface.texels import TexelFrame, Texels, make_texels, place_texels, texel_colours
 from rtgi_addon.backend.surface.tracing import EmbreeTracer
 

@@ -12,10 +12,10 @@ from rtgi_addon.backend.final_gather.link_store import LinkStore
 from rtgi_addon.backend.final_gather.links import make_links
 from rtgi_addon.backend.lamps.sky import make_sky
 from rtgi_addon.backend.parallel import Workers
-from rtgi_addon.backend.photon.scatter import make_surfaces
 from rtgi_addon.backend.scene import Instance, Scene, World
 from rtgi_addon.backend.settings import SampleCounts
 from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.scatter import make_surfaces
 from rtgi_addon.backend.surface.texels import make_texels, place_texels, texel_colours
 from rtgi_addon.backend.surface.tracing import EmbreeTracer
 from tests.backend import scenes

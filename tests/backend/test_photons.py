@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from rtgi_addon.backend.lamps.emission import all_photons, photon_counts
 from rtgi_addon.backend.photon import photons as ph
-from rtgi_addon.backend.photon.photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits
 from rtgi_addon.backend.photon.paths import (
     BACK,
     END_ABSORBED,
@@ -22,8 +21,9 @@ from rtgi_addon.backend.photon.paths import (
     join_paths,
     take_paths,
 )
-from rtgi_addon.backend.photon.scatter import choose, reflect, refract
+from rtgi_addon.backend.photon.photon_map import bounced_hits, caustic_hits, direct_hits, lamp_hits
 from rtgi_addon.backend.scene import Atlas, Instance, Material, Scene
+from rtgi_addon.backend.surface.scatter import choose, reflect, refract
 from tests.backend.rig import make_rig
 from tests.backend.scenes import box, cornell, grid_atlas, point_light, quad, sphere
 

@@ -20,12 +20,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..lamps.sky import Sky
-from ..photon.scatter import ABSORBED, Surfaces, scatter
 from ..sampling import dot, frames, hash_keys, unit_float32
 from ..scene import Bool, Float32, Float64, Int32
 from ..settings import SampleCounts
 from ..surface.geometry import Geometry
 from ..surface.rasterise import POINTS
+from ..surface.scatter import ABSORBED, Surfaces, scatter
 from ..surface.texels import TexelFrame, Texels
 from ..surface.tracing import FREE, WALL, Hits, Tracer
 from .aims import Aims, density_on_texels, follow_aims, place_aims, target_density

@@ -34,12 +34,12 @@ from ..progress import Report, silent
 from ..sampling import make_discrete, photon_numbers, sample_cone, to_frame, unit_float64
 from ..scene import Bool, Float32, Float64, FrameState, Light, LightKind, Material, Scene
 from ..surface.geometry import Geometry
+from ..surface.scatter import Surfaces
 from ..surface.texels import TexelFrame, Texels
 from ..surface.tracing import Tracer
 from .paths import EnergyBook, PhotonPaths, take_paths
 from .photon_map import caustic_hits, make_photon_map, photon_irradiance
 from .photons import trace_photons
-from .scatter import Surfaces
 
 #: More generators than this are taken as one sphere around all: the mixture's density costs one test for each.
 MOST_GENERATORS = 32

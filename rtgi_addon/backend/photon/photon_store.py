@@ -19,13 +19,13 @@ from ..parallel import Workers
 from ..scene import Bool, Float32, Float64, Int32
 from ..selection.sweep import Sweep
 from ..settings import Selection
+from ..surface.scatter import Surfaces
 from ..surface.texels import Texels
 from ..surface.tracing import Tracer
 from .groups import GROUP_SIZE, Rows, make_groups
 from .path_pool import NOBODY, PathPool, equal_bits, moved_rows
 from .paths import AFTER_DIFFUSE, END_ESCAPED, PhotonPaths, take_paths
 from .photons import emit_photons, flux_factor, trace_starts
-from .scatter import Surfaces
 
 #: Photons of a changed light that are looked at first: where none starts as before the others are not compared.
 _FEW = 64

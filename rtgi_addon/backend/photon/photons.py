@@ -21,6 +21,7 @@ from ..parallel import Workers
 from ..progress import Report, silent
 from ..sampling import photon_numbers, unit_float32, unit_float64
 from ..scene import Float32, Float64, Int32
+from ..surface.scatter import ABSORBED, Surfaces, scatter
 from ..surface.tracing import Hits, Tracer
 from .paths import (
     AFTER_DIFFUSE,
@@ -36,7 +37,6 @@ from .paths import (
     join_paths,
     scaled_paths,
 )
-from .scatter import ABSORBED, Surfaces, scatter
 
 _FLAG_OF_KIND = np.array([AFTER_DIFFUSE, AFTER_SPECULAR, AFTER_SPECULAR, 0, 0], np.uint8)  # by scatter's kinds
 

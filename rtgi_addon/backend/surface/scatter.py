@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from ..sampling import Floats, dot, sample_cosine_about
 from ..scene import Bool, Float32, Int32, Material
-from ..surface.geometry import Geometry
-from ..surface.texels import Texels
-from ..surface.tracing import Hits
+from .geometry import Geometry
+from .texels import Texels
+from .tracing import Hits
 
 #: Kinds of event.
 DIFFUSE, MIRROR, REFRACT, THROUGH, ABSORBED = (np.uint8(k) for k in range(5))
