@@ -20,19 +20,13 @@ from .final_gather.components import SurfaceGraph
 from .final_gather.lighting import Light, Lighting
 from .final_gather.rooms import look_around, rooms_of
 from .finish.finisher import Finisher, OidnOpening, fill
-from .lamps import emission
-from .lamps.direct import make_shadows
-from .lamps.direct_store import DirectStore
 from .limits import bounded_scene, bounded_state
+from .outside import OutsideLight
 from .parallel import Workers
-from .photon import caustics
-from .photon.photon_light import Hits, PhotonLight
-from .photon.photon_store import PhotonStore
 from .placed import PlacedScene
 from .progress import Report, silent
 from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
-from .selection.changes import Change
-from .settings import AimBounced, AimDirect, BakeSettings, Caustics, LiveSettings, SampleCounts, Selection
+from .settings import BakeSettings, LiveSettings, SampleCounts, Selection
 from .stats import FrameStats
 from .surface.geometry import Geometry
 from .surface.texels import Texels
@@ -97,24 +91,13 @@ class Session:
         oidn = OidnOpening(settings, oidn_paths)
         self._workers = Workers(settings.threads)
         self._placed = PlacedScene(scene, atlas, states[0], states[1:], self._workers)
-        self._bounds = emission.make_bounds(self._placed.geometry)
-        self._sides = sending_sides(scene, atlas)
-        self._direct_store = DirectStore()
-        self._photons = self._photon_light(diffuse=True)
-        self._caustic_photons = self._photon_light(diffuse=False)
+        self._outside = OutsideLight(self._placed, atlas, settings)
         self._live = live
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
         self._broken = False  # a frame was cut short: what is kept may be of two frames
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
         self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers, live)
-
-    def _photon_light(self, *, diffuse: bool) -> PhotonLight:
-        most = self.settings.max_bounces if diffuse else self.settings.max_specular + 1
-        store = PhotonStore(
-            self.texels, selection=self.settings.selection, max_bounces=most, seed=self.settings.seed, diffuse=diffuse
-        )
-        return PhotonLight(store, nearest=self.settings.nearest_photons)
 
     @property
     def texels(self) -> Texels:
@@ -155,7 +138,7 @@ class Session:
                 self._forget()
             self._lighting.follow(self._placed, change, stats)
         self._report("place", 1, STAGE_COUNT)
-        outside, caustic = self._outside(change, stats)
+        outside, caustic = self._outside.light(change, stats, self._report, STAGE_COUNT)
         lit = self._illuminate(outside, self._first_samples(), stats)
         while (more := self._more_samples(lit, stats)) is not None:
             lit = self._illuminate(outside, more, stats)
@@ -170,16 +153,13 @@ class Session:
         stats.warnings += self._finisher.warnings
         self._broken = False
         if self._live is not None:  # guide and first frame are lit whole
-            self._photons.limit(self._live)
-            self._caustic_photons.limit(self._live)
+            self._outside.limit(self._live)
         return FrameResult(maps, stats)
 
     def _forget(self) -> None:
         """Keep no ray of the frames before."""
         self._lighting.forget()
-        self._direct_store.clear()
-        self._photons.forget()
-        self._caustic_photons.forget()
+        self._outside.forget()
 
     def _first_samples(self) -> SampleCounts:
         return PILOT if self.settings.target_error is not None else self.settings.samples
@@ -207,7 +187,7 @@ class Session:
             links = lighting.links(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
         with stats.stage("aim"):
-            light = lighting.light(placed, links, samples, outside, self._photon_aim(outside))
+            light = lighting.light(placed, links, samples, outside, self._outside.photon_aim(outside))
         self._report("aim", 5, STAGE_COUNT)
         with stats.stage("denoise"):
             end, apart = self._finisher, light.component
@@ -236,73 +216,12 @@ class Session:
         for state in reversed(states):
             change = placed.follow(state)
             if self.settings.selection is Selection.PROBE:  # what is aimed at must not hang on what probes have found
-                self._photons.forget()
-                self._caustic_photons.forget()
+                self._outside.forget_photons()
             setup.rays += look_around(placed, seen, self.settings.seed)
-            outside, _ = self._outside(change, setup)
+            outside, _ = self._outside.light(change, setup, self._report, STAGE_COUNT)
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
             weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
         return bright_targets(weights, rooms_of(seen, self.texels.surface))
-
-    def _outside(self, change: Change, stats: FrameStats) -> tuple[Float32, Float32 | None]:
-        """((n, 3) all light that does not come by links, (n, 3) of it caustics or None)."""
-        if self._uses_photons:
-            with stats.stage("photons"):
-                self._follow_photons(change, stats)
-        with stats.stage("direct"):
-            direct = self._direct(change, stats)
-        self._report("direct", 2, STAGE_COUNT)
-        with stats.stage("caustics"):
-            caustic = self._caustics(change, stats)
-        self._report("caustics", 3, STAGE_COUNT)
-        return (direct if caustic is None else direct + caustic), caustic
-
-    @property
-    def _uses_photons(self) -> bool:
-        return AimDirect.PHOTONS is self.settings.aim_direct or AimBounced.PHOTONS is self.settings.aim_bounced
-
-    def _follow_photons(self, change: Change, stats: FrameStats) -> None:
-        placed = self._placed
-        bounds = emission.grown_bounds(self._bounds, placed.geometry)
-        sources = emission.make_sources(self.scene, placed.state, placed.geometry, bounds, sides=self._sides)
-        counts = emission.photon_counts(sources, self.settings.photons)
-        self._photons.follow(placed, change, sources, counts, stats)
-
-    def _direct(self, change: Change, stats: FrameStats) -> Float32:
-        """(n, 3) from lamps, by shadow rays; by photons when the settings say so."""
-        placed = self._placed
-        if self.settings.aim_direct is AimDirect.PHOTONS:
-            return self._photons.irradiance(placed, Hits.DIRECT)
-        done = self._direct_store.update(
-            placed.state.lights, placed.frame, make_shadows(placed.tracer, placed.geometry, placed.materials),
-            self._workers, sweep=None if change.everything else change.sweep, changed_texels=change.texels,
-            samples=self.settings.direct_samples, seed=self.settings.seed,
-        )  # fmt: skip
-        stats.rays += done.rays
-        return done.direct
-
-    def _caustics(self, change: Change, stats: FrameStats) -> Float32 | None:
-        """(n, 3) from lamps by way of mirrors and glass; None where the scene has none, or they are not asked for."""
-        if self.settings.caustics is Caustics.OFF:
-            return None
-        placed = self._placed
-        generators = caustics.find_generators(self.scene, placed.state, placed.geometry, placed.materials)
-        sources: list[emission.PhotonSource] = []
-        if len(generators.radius):
-            bounds = emission.grown_bounds(self._bounds, placed.geometry)
-            sources = caustics.caustic_sources(placed.state, placed.geometry, bounds, generators)
-        counts = emission.photon_counts(sources, self.settings.photons)
-        self._caustic_photons.follow(placed, change, sources, counts, stats)
-        if not sources and self.settings.caustics is not Caustics.ON:
-            return None
-        return self._caustic_photons.irradiance(placed, Hits.CAUSTIC)
-
-    def _photon_aim(self, outside: Float32) -> Float32 | None:
-        """(n, 3) all light as photons tell it; None where radiosity's fixed point does."""
-        if self.settings.aim_bounced is not AimBounced.PHOTONS:
-            return None
-        # Lamps' light is in `outside` until it has bounced diffusely; all of sky's and emissive meshes' is here.
-        return outside + self._photons.irradiance(self._placed, Hits.BOUNCED)
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end, stand_in = self._finisher, lit.light.stand_in
@@ -313,13 +232,6 @@ class Session:
             caustics=None if caustic is None else end.to_pages(fill(caustic, stand_in), stand_in),
             valid=end.valid_pages(stand_in == np.arange(self.texels.count)),
         )
-
-
-def sending_sides(scene: Scene, atlas: Atlas) -> Bool:
-    """(instances, 2) which sides send light: those with a map, and both of an object that has no map by choice."""
-    mapped = [[p is not None for p in pair] for pair in zip(atlas.front, atlas.back, strict=True)]
-    unmapped = np.array([not i.receives_light for i in scene.instances], np.bool_)
-    return np.array(mapped, np.bool_).reshape(-1, 2) | unmapped[:, None]
 
 
 def noise_estimate(full: Float32, half: Float32) -> float | None:
