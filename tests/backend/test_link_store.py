@@ -25,6 +25,7 @@ from rtgi_addon.backend.settings import SampleCounts
 from tests.backend.acts import ACTS, random_story
 from tests.backend.scenes import cornell, translation
 from tests.backend.stories import BARE
+from tests.backend.test_selection_hard import EXAMPLES
 
 ALL = 1 << 30  # bytes: memory for all links of these scenes
 SHORT = 5  # instance of cornell()
@@ -86,7 +87,7 @@ def differing(a: LinkStore, b: LinkStore) -> list[str]:
     seed=st.integers(0, 2**16),
     share=st.sampled_from([1.0, 1.0, 0.5, 0.0]),
 )
-@settings(max_examples=20, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
+@settings(max_examples=2 * EXAMPLES, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 def test_kept_links_are_those_of_a_fresh_trace(steps: list[list[str]], seed: int, share: float) -> None:
     story = random_story(steps, seed)
     stage = Set(story.scene, story.atlas)

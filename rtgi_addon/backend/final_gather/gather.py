@@ -192,9 +192,9 @@ class GatherRays:
         weight = np.full(len(texel), 1 / np.float32(self.n_cosine), np.float32)
         if self.n_bright:
             per_area = hits.distance * hits.distance / np.maximum(np.abs(hits.cosine), np.float32(1e-6))
-            density = self._density.reshape(-1).take(self._first_density.take(texel) + target, mode="clip") * np.where(
-                escaped, np.float32(1), per_area
-            )
+            density = self._density.reshape(-1).take(self._first_density.take(texel) + target, mode="clip")
+            with np.errstate(over="ignore"):  # on a texel of next to no area
+                density *= np.where(escaped, np.float32(1), per_area)
             density[target < 0] = 0
             at = self.pattern.take(texel) * np.int32(self.n_cosine) + number
             cosine = np.maximum(self.cosine_table.directions[2].reshape(-1).take(at), np.float32(1e-6))
@@ -229,10 +229,11 @@ class GatherRays:
         cos_there = -dot(ways, self.aims.normal.take(at, axis=0)) / distance
         seen = (cos_here > 0) & above & (is_sky | (cos_there > 1e-6))
         per_area = np.where(is_sky, np.float32(1), distance2 / np.maximum(cos_there, np.float32(1e-6)))
-        density = self.aims.density.take(at) * per_area
         n_c, n_b = np.float32(self.n_cosine), np.float32(self.n_bright)
         p_c = cos_here * np.float32(1 / np.pi)
-        weight = np.where(seen, p_c / np.maximum(n_c * p_c + n_b * density, np.finfo(np.float32).tiny), 0)
+        with np.errstate(over="ignore"):  # on a texel of next to no area, whose samples then weigh nothing
+            density = self.aims.density.take(at) * per_area
+            weight = np.where(seen, p_c / np.maximum(n_c * p_c + n_b * density, np.finfo(np.float32).tiny), 0)
         rows = np.nonzero(seen)[0]
         ends = np.where(is_sky, np.float32(np.inf), np.float32(1))[rows]
         blocked = self._tracer.blocked(origins[rows], ways[rows], ends)
