@@ -165,7 +165,10 @@ class Lighting:
         stale = np.ones(placed.texels.count, np.bool_)
         if kept.inputs is not None and kept.renewed is not None:
             stale = _stale(kept.inputs, now, kept.renewed, surface)
-        light = self._solved(now, kept.light, np.nonzero(stale)[0], np.where(coupled, component, -1)[surface])
+        texels = np.nonzero(stale)[0]
+        if len(texels) and kept.store.kept < kept.store.count:
+            texels = np.arange(len(stale))  # links that are not kept are traced for all or none
+        light = self._solved(now, kept.light, texels, np.where(coupled, component, -1)[surface])
         kept.inputs, kept.light = now, replace(light, updated=stale)
         return kept.light
 

@@ -19,13 +19,11 @@ from ..selection.sweep import Sweep
 from ..surface.rasterise import POINTS
 from .beyond_store import BeyondStore
 from .components import SurfaceGraph
-from .gather import NO_TARGET, GatherRays, TracedTexels
+from .gather import NO_TARGET, Beyond, GatherRays, TracedTexels
 from .touched import Kept, touched_rays
 
 #: Target, weight and pending mark of a link; a cosine ray's length besides.
 BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
-
-
 #: Pieces that work is cut into, at the least. More and smaller ones would keep more threads busy, but NumPy's threads
 #: stand in one another's way below some ten thousand numbers at a time.
 PARTS = 2
@@ -68,6 +66,7 @@ class LinkStore:
         self._filled = False  # is anything traced yet?
         self.beyond = BeyondStore(rays.n_cosine)
         self.graph = SurfaceGraph(rays.texels.surface_count)
+        self._known_pairs: dict[str, tuple[Int32, Int32]] = {}  # of links that the graph has no counts of
         self._surface = rays.texels.surface
         self._surface_of_column = np.full(self.nothing + 1, -1, np.int32)
         self._surface_of_column[:count] = rays.texels.surface
@@ -79,13 +78,7 @@ class LinkStore:
         return self.target.nbytes + self.weight.nbytes + self._distance.nbytes + self._pending.nbytes
 
     def components(self) -> tuple[Int32, Bool]:
-        """((s,) which surfaces exchange light, numbered; (s,) whether they exchange any).
-
-        Links that are not kept, and those beyond mirrors and glass, are not followed: all surfaces are then one.
-        """
-        if self.kept < self.count or self.beyond.all.rays:
-            count = self.graph.surface_count
-            return np.zeros(count, np.int32), np.ones(count, np.bool_)
+        """((s,) which surfaces exchange light, numbered; (s,) whether they exchange any)."""
         return self.graph.labels(), self.graph.coupled()
 
     @property
@@ -151,6 +144,8 @@ class LinkStore:
         work.kept = self.target.size - work.renewed
         self._pending[inside] = False
         self._pending_texel[texel] = False
+        beyond = self.beyond.all
+        self._set_pairs("beyond", self._surface[beyond.ray // self._cosine], self._surface_of_column[beyond.target])
         return work
 
     def _known(self, rows: slice, asked: Bool, moved_column: Bool) -> Kept:
@@ -233,7 +228,7 @@ class LinkStore:
         """Trace all links of ``texel``."""
         if not len(texel):
             return
-        beyond = []
+        beyond, loose = [], []
         kept = texel[texel < self.kept]
         if self._filled:
             self.graph.remove(*self._pairs(kept))
@@ -253,6 +248,8 @@ class LinkStore:
             )
             if inside.all():
                 beyond.append((rows.start, traced.beyond))
+            else:
+                loose.append(self._pairs_of_rows(of, target, weight, traced.beyond))
             return traced.rays
 
         work.traced += sum(self._workers.map_slices(part, len(texel), self.chunk_of(len(texel))))
@@ -260,6 +257,26 @@ class LinkStore:
         self.graph.add(*self._pairs(kept))
         self._filled = True
         self.beyond.replace_texels(texel, [b for _, b in sorted(beyond, key=lambda pair: pair[0])])
+        if loose:
+            self._set_pairs("loose", *(np.concatenate(column) for column in zip(*loose, strict=True)))
+
+    def _pairs_of_rows(self, texel: Int32, target: Int32, weight: Float32, beyond: Beyond) -> tuple[Int32, Int32]:
+        """Each pair of surfaces once that links of ``texel`` (m,), which are not kept, lead from and to."""
+        row = np.broadcast_to(self._surface[texel][:, None], target.shape)
+        there = np.where(weight > 0, self._surface_of_column.take(target), np.int32(-1))
+        row = np.concatenate([row.reshape(-1), self._surface[beyond.ray // self._cosine]])
+        there = np.concatenate([there.reshape(-1), self._surface_of_column[beyond.target]])
+        return _each_once(row, there, self.graph.surface_count)
+
+    def _set_pairs(self, name: str, row: Int32, target: Int32) -> None:
+        """Of links that are not counted in the graph, let it know which pairs of surfaces there are."""
+        before = self._known_pairs.get(name)
+        if before is None and not len(row):
+            return
+        if before is not None:
+            self.graph.remove(*before)
+        self._known_pairs[name] = _each_once(row, target, self.graph.surface_count)
+        self.graph.add(*self._known_pairs[name])
 
     def rows(self, traced: TracedTexels) -> tuple[Int32, Float32]:
         """((m, K), (m, K)) target and weight of traced texels, as kept."""
@@ -289,6 +306,12 @@ class LinkStore:
         at = texel if slot is None else (texel, slot)
         target = self._surface_of_column.take(self.target[at])
         return row, np.where(self.weight[at] > 0, target, np.int32(-1))
+
+
+def _each_once(row: Int32, target: Int32, count: int) -> tuple[Int32, Int32]:
+    """Every pair with a target (not -1) once."""
+    key = np.unique(row[target >= 0].astype(np.int64) * count + target[target >= 0])
+    return (key // count).astype(np.int32), (key % count).astype(np.int32)
 
 
 def _even(total: int, most: int, least: int) -> int:
