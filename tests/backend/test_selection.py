@@ -145,6 +145,7 @@ STUDIO: dict[str, Make] = {
 }
 LOOK_STORIES: dict[str, Make] = {
     "albedo": in_studio(lambda s: looking(s, PAINT, lambda t: {"albedo": (t, 0.5, 1 - t)})),
+    "albedo without mirrors": in_the_box(lambda s: looking(s, 1, lambda t: {"albedo": (t, 0.5, 1 - t)})),
     "albedo of glass": in_studio(lambda s: looking(s, GLASS, lambda t: {"albedo": (0.1 * t, 0.0, 0.1)})),
     "emission": in_studio(lambda s: looking(s, GLOW, lambda t: {"emission": (4 * t, 0.0, 1.0)})),
     "emission begins": in_the_box(lambda s: looking(s, 1, lambda t: {"emission": (max(0.0, t - 0.5),) * 3})),

@@ -19,10 +19,10 @@ from bench.sequences import FrameSequence
 from rtgi_addon.backend.final_gather import lighting
 from rtgi_addon.backend.final_gather.link_store import LinkStore
 from rtgi_addon.backend.finish.oidn import find_oidn
-from rtgi_addon.backend.scene import FrameState, Instance, Scene
+from rtgi_addon.backend.scene import FrameState, Instance, Material, Scene
 from rtgi_addon.backend.settings import AimBounced, AimDirect, Quality
 from tests.backend.acts import ACTS, random_story
-from tests.backend.scenes import box, cornell, grid_atlas, point_light, translation
+from tests.backend.scenes import WHITE, box, cornell, grid_atlas, point_light, translation
 from tests.backend.stories import (
     BARE,
     assert_lawful,
@@ -93,6 +93,19 @@ def crowd() -> FrameSequence:
     return FrameSequence("crowd", "", scene, atlas, frames(state))
 
 
+def guest() -> FrameSequence:
+    """A black crumb close to the lamp, that no wall sees, leaves a closed room and comes back: the walls' links and
+    direct light stay as they are, but they are no longer solved with the crumb."""
+    meshes = (box("room", (2, 2, 2), texels=6, inward=True), box("crumb", (0.01, 0.01, 0.01), texels=2, material=1))
+    instances = (Instance("room", 0, np.eye(4)), Instance("crumb", 1, translation(0, 0, 0.5), moving=True))
+    black = Material("black", (0.0, 0.0, 0.0))
+    lamp = replace(point_light((0, 0, 0.53), 50.0), casts_shadow=False)
+    scene = Scene(meshes, instances, (WHITE, black), (lamp,))
+    atlas = grid_atlas(scene, [(24, 16), (12, 8)])
+    states = placed(scene, lambda t: {"crumb": translation(0, 0.02 * t, 90.0 if 0.3 < t < 0.6 else 0.5)})
+    return FrameSequence("guest", "", scene, atlas, states)
+
+
 HARD: dict[str, Callable[[], FrameSequence]] = {
     "slides on the floor": lambda: in_the_box(lambda t: turned(0.0, 0.5 - t, -0.6, 0.3), 11),
     "slides along texel borders and the wall": lambda: in_the_box(lambda t: turned(0.0, 0.7, 0.7 - t, 0.3), 10),
@@ -109,6 +122,7 @@ HARD: dict[str, Callable[[], FrameSequence]] = {
     "has no texels": lambda: in_the_box(lambda t: turned(t, t - 0.5, -0.5, 0.3), receives_light=False),
     "twins that deform": twins,
     "a crowd": crowd,
+    "a guest leaves": guest,
 }
 
 
