@@ -19,10 +19,13 @@ from bench.sequences import FrameSequence
 from rtgi_addon.backend.final_gather import lighting
 from rtgi_addon.backend.final_gather.link_store import LinkStore
 from rtgi_addon.backend.finish.oidn import find_oidn
+from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.scene import FrameState, Instance, Material, Scene
 from rtgi_addon.backend.settings import AimBounced, AimDirect, Quality
+from rtgi_addon.backend.surface.geometry import Geometry
+from rtgi_addon.backend.surface.tracing import EmbreeTracer
 from tests.backend.acts import ACTS, random_story
-from tests.backend.scenes import WHITE, box, cornell, grid_atlas, point_light, translation
+from tests.backend.scenes import WHITE, box, cornell, grid_atlas, point_light, quad, translation
 from tests.backend.stories import (
     BARE,
     assert_lawful,
@@ -206,3 +209,17 @@ def test_random_stories(steps, seed, bounced, direct, quality, target, threads) 
     count = len(story.states)
     order = [*range(count), *np.random.default_rng(seed).integers(0, count, 4).tolist()]
     assert_lawful(story, choice, order=order, alone=(count - 1,))
+
+
+def test_thousands_of_movers_are_no_crash() -> None:
+    """Each has an Embree scene of its own."""
+    chip, count = quad("chip", [(0, 0, 0), (0.5, 0, 0), (0.5, 0.5, 0), (0, 0.5, 0)]), 2500
+    instances = tuple(Instance(f"chip {i}", 0, translation(i, 0, 0), moving=True) for i in range(count))
+    scene = Scene((chip,), instances, (WHITE,))
+    state, workers = scene.first_frame(), Workers(1)
+    geometry = Geometry(scene, state)
+    tracer = EmbreeTracer(scene, geometry, state, workers)
+    chosen = np.array([0, 1100, 2499])
+    origins = np.stack([chosen + 0.25, chosen * 0 + 0.25, chosen * 0 + 1.0], axis=1) - geometry.origin
+    hits = tracer.intersect(origins.astype(np.float32), np.tile(np.float32([0, 0, -1]), (3, 1)))
+    np.testing.assert_array_equal(hits.triangle // 2, chosen)

@@ -14,6 +14,7 @@ from typing import Any, Protocol
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore import EmbreeDevice
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
 
@@ -132,6 +133,8 @@ class EmbreeTracer:
         self._scene = scene
         self._geometry = geometry
         self._workers = workers
+        # One for all parts: each takes a slot of the process, of which Linux has 1024, and then crashes.
+        self._device = EmbreeDevice()
         self._visible: Bool = state.visible.copy()
         self._still = self._build_still()
         self._movers = {i: self._place(i, state, None) for i in self._present(moving=True)}
@@ -196,7 +199,7 @@ class EmbreeTracer:
         if not indices:
             return None
         rows = np.concatenate([np.arange(s.start, s.stop) for s in map(self._geometry.triangles_of, indices)])
-        return _part(self._geometry.corners[rows], rows)
+        return _part(self._device, self._geometry.corners[rows], rows)
 
     def _place(self, index: int, state: FrameState, before: Place | None) -> Place:
         """Where a mover stands; its triangles are built anew only where they deform."""
@@ -212,7 +215,7 @@ class EmbreeTracer:
             corners = state.vertices.get(mesh_index, mesh.vertices)[mesh.triangles]
             # Float32 is finest about the middle; a mesh may lie a kilometre from its object's origin.
             centre = _middle(_finite(corners))
-            part = replace(_part(corners - centre, np.arange(rows.start, rows.stop)), centre=centre)
+            part = replace(_part(self._device, corners - centre, np.arange(rows.start, rows.stop)), centre=centre)
         part = replace(part, to_object=np.concatenate([inverse, (shift - part.centre)[:, None]], axis=1))
         return Place(index, part, *_sphere(self._geometry.corners[rows], self._geometry))
 
@@ -255,8 +258,8 @@ class EmbreeTracer:
         return blocked
 
 
-def _part(corners: Float32 | Float64, rows: Any) -> Part:
-    embree = EmbreeScene()
+def _part(device: Any, corners: Float32 | Float64, rows: Any) -> Part:
+    embree = EmbreeScene(device)
     # Embree ignores a triangle with a non-finite corner; a degenerate one is never hit.
     TriangleMesh(embree, np.ascontiguousarray(corners, np.float32))
     return Part(embree, rows.astype(np.int32))
