@@ -13,7 +13,7 @@ from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rtgi_addon.backend.settings import BakeSettings, Quality
 
@@ -24,8 +24,15 @@ from .sequences import SEQUENCES
 log = logging.getLogger("bench")
 Result = TypeVar("Result")
 
-#: Rays a texel of the played sequences, by name.
-QUALITIES = (Quality.PREVIEW, Quality.DRAFT)
+#: How sequences are played, by name: what a bake's default is, few rays, and those without an error estimate, which
+#: costs a second denoise and which nobody reads while a scene moves before his eyes.
+KINDS: dict[str, dict[str, Any]] = {
+    "preview": {"quality": Quality.PREVIEW},
+    "draft": {"quality": Quality.DRAFT},
+    "live": {"quality": Quality.DRAFT, "estimate": False},
+}
+#: Kinds whose maps are alike flicker alike.
+FLICKERING = ("preview", "draft")
 #: Maps are compared with converged ones at these frames; at none where another sequence says as much.
 COMPARED = {"slow": (), "still": frames.COMPARED[:1]}
 
@@ -69,14 +76,14 @@ def bench_frames() -> FramesResult:
         sequence = make()
         compared = COMPARED.get(name, frames.COMPARED)
         converged = frames.converge(sequence, compared) if compared else None
-        for quality in QUALITIES:
-            settings = BakeSettings(quality=quality, **sequence.options)
-            played.append(frames.play(sequence, settings, oidn, label=quality.value, converged=converged))
+        for label, kind in KINDS.items():
+            settings = BakeSettings(**kind, **sequence.options)
+            played.append(frames.play(sequence, settings, oidn, label=label, converged=converged))
             _log(played[-1])
     sequence = SEQUENCES["slow"]()
     truth = flicker.true_changes(sequence)
-    for quality in QUALITIES:
-        flickers.append(flicker.flicker(sequence, BakeSettings(quality=quality), oidn, truth, label=quality.value))
+    for label in FLICKERING:
+        flickers.append(flicker.flicker(sequence, BakeSettings(**KINDS[label]), oidn, truth, label=label))
     return FramesResult(machine, played, flickers)
 
 
