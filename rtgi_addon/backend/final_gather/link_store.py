@@ -27,8 +27,10 @@ BYTES_PER_LINK, BYTES_PER_LENGTH = 9, 4
 #: Pieces that work is cut into, at the least. More and smaller ones would keep more threads busy, but NumPy's threads
 #: stand in one another's way below some ten thousand numbers at a time.
 PARTS = 2
+#: More moved objects than this cost as much to test for as all rays cost to trace (hall of 64 blocks: at 12).
+MOST_PLACES = 12
 #: Fewer rays than this are not worth a second thread.
-LEAST_RAYS = 1 << 12
+LEAST_RAYS = 1 << 13
 
 
 @dataclass
@@ -96,6 +98,7 @@ class LinkStore:
         self._pending_texel[self.kept :] = True
         moved = sweep.moved[rays.texels.instance]
         whole = moved | self._cut_near(rays, sweep, reach)
+        whole |= len(sweep.taken) > MOST_PLACES
         skipped = whole[: self.kept] | self._pending.all(axis=1)
         moved_column = np.append(moved, np.zeros(self.nothing + 1 - self.count, np.bool_))
 
@@ -319,8 +322,8 @@ def _even(total: int, most: int, least: int) -> int:
 
     No result hangs on it.
     """
-    rounds = -(-total // (most * PARTS))
-    return max(least, -(-total // max(rounds * PARTS, 1)))
+    parts = -(-total // (most * PARTS)) * PARTS
+    return max(1, -(-total // max(1, min(parts, total // least))))
 
 
 def _totals(weight: Float32) -> Float64:

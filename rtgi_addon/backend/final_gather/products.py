@@ -17,6 +17,8 @@ from ..scene import Float32, Int32
 
 #: Links worked on at a time by one thread: read three times, they should come from its cache.
 PART_LINKS = 1 << 19
+#: Fewer are multiplied sooner by one thread than two threads are set to work.
+LEAST_LINKS = 1 << 18
 
 
 def row_products(target: Int32, weight: Float32, target_count: int, workers: Workers) -> Callable[[Float32], Float32]:
@@ -35,7 +37,7 @@ def row_products(target: Int32, weight: Float32, target_count: int, workers: Wor
         raise ValueError(f"targets {target.min()} .. {target.max()} are not all within 0 .. {target_count - 1}")
     count, width = target.shape
     per_thread = -(-count // workers.count)
-    rows = max(1, min(per_thread, PART_LINKS // max(width, 1)))
+    rows = max(1, min(max(per_thread, LEAST_LINKS // max(width, 1)), PART_LINKS // max(width, 1)))
     parts = [_matrix(target[a : a + rows], weight[a : a + rows], target_count) for a in range(0, count, rows)]
 
     def product(x: Float32) -> Float32:

@@ -152,7 +152,7 @@ def lamp_irradiance(
         return _sampled(light, number, texels[rows], receivers, shadows, seed)
 
     # Few texels are still cut in two, for two threads.
-    chunk = min(max(1, CHUNK_RAYS // receivers.samples), max(256, -(-len(texels) // 2)))
+    chunk = min(max(1, CHUNK_RAYS // receivers.samples), max(512, -(-len(texels) // 2)))
     done = workers.map_slices(part, len(texels), chunk)
     if not done:
         return LampLight(np.zeros(0, np.float32), np.zeros(0, np.bool_), 0)
