@@ -94,10 +94,7 @@ def make_receivers(
     offset = geometry.offset_length(position)
     if samples == 1:
         return Receivers(frame, samples, offset, offset)
-    away = frame.points[texels] - position[:, None]
-    away *= away
-    squared = away[..., 0] + away[..., 1] + away[..., 2]
-    return Receivers(frame, samples, offset, offset + np.sqrt(squared.max(axis=1, initial=0)))
+    return Receivers(frame, samples, offset, offset + frame.reach[texels])
 
 
 def direct_irradiance(
