@@ -179,9 +179,7 @@ def settings_of(arguments: argparse.Namespace) -> BakeSettings:
 
 def typed_settings(values: Mapping[str, Any]) -> BakeSettings:
     """Settings from ``values`` by field name, words for the enumerated ones; other keys are ignored."""
-    hints = get_type_hints(BakeSettings)
-    names = [f.name for f in fields(BakeSettings)]
-    return BakeSettings(**{n: hints[n](values[n]) if _choices(hints[n]) else values[n] for n in names})
+    return BakeSettings(**{f.name: values[f.name] for f in fields(BakeSettings)})
 
 
 def frames_of(text: str | None) -> Sequence[int] | None:

@@ -6,14 +6,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rtgi_addon.backend.lamps.emission import all_photons, photon_counts
 from rtgi_addon.backend.photon.caustics import (
     MOST_GENERATORS,
-    caustic_irradiance,
     caustic_sources,
     find_generators,
-    trace_caustics,
 )
-from rtgi_addon.backend.photon.photon_map import caustic_hits
+from rtgi_addon.backend.photon.paths import take_paths
+from rtgi_addon.backend.photon.photon_map import caustic_hits, make_photon_map, photon_irradiance
+from rtgi_addon.backend.photon.photons import trace_photons
 from rtgi_addon.backend.scene import Instance, Light, LightKind, Material, Scene
 from tests.backend.rig import Rig, make_rig
 from tests.backend.scenes import box, grid_atlas, point_light, quad, sphere, translation
@@ -41,10 +42,17 @@ def rig_with(light: Light, *places, radius: float = 0.4) -> Rig:
 def aimed(rig: Rig, count: int):
     generators = find_generators(rig.scene, rig.state, rig.geometry, rig.scene.materials)
     sources = caustic_sources(rig.state, rig.geometry, rig.bounds, generators)
-    paths, _ = trace_caustics(
-        sources, photons=count, surfaces=rig.surfaces, tracer=rig.tracer, workers=rig.workers, max_bounces=32
-    )
-    return paths
+    counts = photon_counts(sources, count)
+    paths, _ = trace_photons(
+        sources, counts, *all_photons(counts), surfaces=rig.surfaces, tracer=rig.tracer, workers=rig.workers,
+        max_bounces=32, diffuse=False,
+    )  # fmt: skip
+    return take_paths(paths, np.unique(paths.path_of_hit[caustic_hits(paths)]))
+
+
+def map_of(paths):
+    """Photons that came by mirrors and glass alone."""
+    return make_photon_map(paths, caustic_hits(paths))
 
 
 def walls(rig: Rig, paths) -> np.ndarray:
@@ -98,7 +106,7 @@ def test_only_paths_by_mirror_or_glass_are_kept() -> None:
 
 def test_caustic_under_a_glass_ball_is_brighter_than_without() -> None:
     rig = rig_with(LIGHTS["point"], (0.2, 0.1, -1.2))
-    irradiance = caustic_irradiance(aimed(rig, 20_000), rig.texels, rig.frame, rig.workers, k=32)
+    irradiance = photon_irradiance(map_of(aimed(rig, 20_000)), rig.texels, rig.frame, rig.workers, k=32)
     assert np.isfinite(irradiance).all() and (irradiance >= 0).all()
     at = rig.frame.position + rig.geometry.origin
     floor = (rig.texels.instance == 0) & (at[:, 2] < -1.99)

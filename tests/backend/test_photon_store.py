@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 
 from rtgi_addon.backend.lamps.emission import MESHES, SKY, all_photons
 from rtgi_addon.backend.photon import path_pool
-from rtgi_addon.backend.photon.caustics import caustic_irradiance
 from rtgi_addon.backend.photon.paths import END_ESCAPED, PhotonPaths
 from rtgi_addon.backend.photon.photon_light import Hits, PhotonLight
 from rtgi_addon.backend.photon.photon_map import (
@@ -485,9 +484,8 @@ def test_caustic_photons(name: str) -> None:
     update = movie.update(store, shot)
     scratch = movie.scratch(shot)
     assert identical(store.paths, scratch.paths)
-    maps = [
-        caustic_irradiance(s.paths, movie.texels, movie.placed.frame, movie.workers, k=16) for s in (store, scratch)
-    ]
+    photons = [make_photon_map(s.paths, caustic_hits(s.paths)) for s in (store, scratch)]
+    maps = [photon_irradiance(p, movie.texels, movie.placed.frame, movie.workers, k=16) for p in photons]
     assert maps[0].tobytes() == maps[1].tobytes()
     if name in ("still", "lamp dims"):  # a lamp that dims much leaves photons to others, no more
         assert update.traced == sum(max(n - first[light], 0) for light, n in shot.counts.items())

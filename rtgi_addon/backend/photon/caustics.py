@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lamps.emission import PhotonSource, all_photons, lamp_identity, photon_counts
+from ..lamps.emission import PhotonSource, lamp_identity
 from ..lamps.lights import (
     FULL_SPREAD,
     Bounds,
@@ -29,17 +29,9 @@ from ..lamps.lights import (
     sun_strength,
     to_axes,
 )
-from ..parallel import Workers
-from ..progress import Report, silent
 from ..sampling import make_discrete, photon_numbers, sample_cone, to_frame, unit_float64
-from ..scene import Bool, Float32, Float64, FrameState, Light, LightKind, Material, Scene
+from ..scene import Float64, FrameState, Light, LightKind, Material, Scene
 from ..surface.geometry import Geometry
-from ..surface.scatter import Surfaces
-from ..surface.texels import TexelFrame, Texels
-from ..surface.tracing import Tracer
-from .paths import EnergyBook, PhotonPaths, take_paths
-from .photon_map import caustic_hits, make_photon_map, photon_irradiance
-from .photons import trace_photons
 
 #: More generators than this are taken as one sphere around all: the mixture's density costs one test for each.
 MOST_GENERATORS = 32
@@ -134,46 +126,6 @@ def caustic_sources(
         if not is_dark(lamp)
     ]
     return [lamp for lamp in lamps if max(lamp.flux) > 0]
-
-
-def trace_caustics(
-    sources: Sequence[PhotonSource],
-    *,
-    photons: int,
-    surfaces: Surfaces,
-    tracer: Tracer,
-    workers: Workers,
-    max_bounces: int,
-    seed: int = 0,
-    report: Report = silent,
-) -> tuple[PhotonPaths, EnergyBook]:
-    """Paths of about ``photons`` photons of :func:`caustic_sources`, but for those that met no generator first."""
-    counts = photon_counts(sources, photons)
-    light, index = all_photons(counts)
-    paths, book = trace_photons(
-        sources, counts, light, index, surfaces=surfaces, tracer=tracer, workers=workers,
-        max_bounces=max_bounces, seed=seed, diffuse=False, report=report,
-    )  # fmt: skip
-    caustic = np.zeros(len(paths.light), np.bool_)
-    caustic[paths.path_of_hit[caustic_hits(paths)]] = True
-    return take_paths(paths, np.nonzero(caustic)[0]), book
-
-
-def caustic_irradiance(
-    paths: PhotonPaths,
-    texels: Texels,
-    frame: TexelFrame,
-    workers: Workers,
-    *,
-    k: int,
-    surfaces: Bool | None = None,
-) -> Float32:
-    """(n, 3) W/m² at each texel, from the hits of ``paths`` after their first mirror or glass.
-
-    ``surfaces``: see :func:`~.photon_map.photon_irradiance`.
-    """
-    photons = make_photon_map(paths, caustic_hits(paths))
-    return photon_irradiance(photons, texels, frame, workers, k=k, surfaces=surfaces)
 
 
 def _aimed_directions(
