@@ -10,7 +10,8 @@ from typing import TypeVar
 
 R = TypeVar("R")
 
-#: Rays worked on at a time: 64k rays with their hits stay in a core's cache (measured, DESIGN §6).
+#: Rays worked on at a time: fewer leave threads waiting for one another between NumPy calls, more leave a core's cache
+#: (measured: 128k beat 64k and 256k by a twentieth).
 CHUNK_RAYS = 1 << 17
 
 
