@@ -25,7 +25,7 @@ def main(zip_file: str, module: str, scene_file: str, result: Path) -> None:
     backend = importlib.import_module(f"{module}.rtgi_addon.backend.surface.tracing")
     seen["backend"] = backend.__file__
     seen["commands"] = len(package._commands)
-    for name in ("embreex", "scipy", "tqdm", "xatlas", "numpy"):
+    for name in ("embreex", "glcontext", "moderngl", "scipy", "tqdm", "xatlas", "numpy"):
         seen[name] = importlib.import_module(name).__file__
     maps = str(result.parent / "maps")
     arguments = ["bake", scene_file, "--out", maps, "--resolution", "64", "--quality", "draft"]
