@@ -17,7 +17,8 @@ import numpy as np
 from .final_gather import radiosity
 from .final_gather.bright import BrightTargets, bright_targets, bright_weight
 from .final_gather.components import SurfaceGraph
-from .final_gather.lighting import Light, Lighting
+from .final_gather.lighting import Light, Lighting, MakeGather
+from .final_gather.link_gather import LinkGather
 from .final_gather.rooms import look_around, rooms_of
 from .finish.finisher import Finisher, OidnOpening, fill
 from .limits import bounded_scene, bounded_state
@@ -97,7 +98,7 @@ class Session:
         self._broken = False  # a frame was cut short: what is kept may be of two frames
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
-        self._lighting = Lighting(settings, self._guide(states[1:] or states), self._workers, live)
+        self._lighting = Lighting(settings, self._link_gather(self._guide(states[1:] or states)), live)
 
     @property
     def texels(self) -> Texels:
@@ -183,8 +184,9 @@ class Session:
     def _illuminate(self, outside: Float32, samples: SampleCounts, stats: FrameStats) -> _Lit:
         """Links with ``samples``, the light they bring, and how far it may be off."""
         placed, lighting = self._placed, self._lighting
+        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
         with stats.stage("links"):
-            links = lighting.links(placed, samples, stats)
+            links = lighting.gather(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
         with stats.stage("aim"):
             light = lighting.light(placed, links, samples, outside, self._outside.photon_aim(outside))
@@ -222,6 +224,17 @@ class Session:
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
             weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
         return bright_targets(weights, rooms_of(seen, self.texels.surface))
+
+    def _link_gather(self, bright: BrightTargets) -> MakeGather:
+        settings = self.settings
+
+        def make(placed: PlacedScene, samples: SampleCounts, memory: int) -> LinkGather:
+            return LinkGather(
+                placed, bright, samples, self._workers,
+                memory=memory, max_specular=settings.max_specular, seed=settings.seed,
+            )  # fmt: skip
+
+        return make
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end, stand_in = self._finisher, lit.light.stand_in

@@ -22,6 +22,7 @@ class FrameStats:
     links_tested: int = 0  # kept links that an object moved near to, looked at ray by ray
     links_traced: int = 0
     links_kept: int = 0
+    views_drawn: int = 0  # texels whose view was drawn, or traced as a whole, on the GPU
     texels_updated: int = 0
     texels_kept: int = 0
     texels_pending: int = 0  # of live frames: still with links of an earlier one

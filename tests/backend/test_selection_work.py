@@ -196,8 +196,8 @@ def test_no_link_of_the_other_room_changes() -> None:
         for state in story.states[:8]:
             session.advance(state)
             kept = next(iter(session._lighting._kept.values()))
-            assert store is None or kept.store is store
-            store = kept.store
+            assert store is None or kept.gather.store is store
+            store = kept.gather.store
             renewed.append(kept.renewed.copy())
         in_b = session.texels.instance == 1
     assert renewed[0].all() and all(r.any() and not r[in_b].any() for r in renewed[1:])

@@ -6,13 +6,12 @@ Links follow what moves; where neither they nor anything they bring light from d
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..parallel import Workers
 from ..placed import PlacedScene
 from ..scene import Bool, Float32, Int32
 from ..selection.changes import Change
@@ -21,10 +20,7 @@ from ..settings import BakeSettings, LiveSettings, SampleCounts
 from ..stats import FrameStats
 from ..surface.texels import surface_areas
 from . import radiosity
-from .bright import BrightTargets
-from .gather import GatherRays
-from .link_store import LinkStore
-from .links import Links, make_links
+from .kept_gather import Irradiance, KeptGather
 
 
 @dataclass(frozen=True)
@@ -43,7 +39,7 @@ class Light:
 class _Inputs:
     """All that a frame's light hangs on."""
 
-    links: Links
+    links: Irradiance
     component: Int32  # (s,)
     outside: Float32  # (n, 3) irradiance that does not come by links
     other: Float32  # (n, 3) irradiance that does not come from texels by links
@@ -54,76 +50,71 @@ class _Inputs:
 
 @dataclass
 class _Kept:
-    """What one number of rays left of its last frame."""
+    """What one number of samples left of its last frame."""
 
-    store: LinkStore
-    links: Links | None = None
-    renewed: Bool | None = None  # (n,) texels whose links are not those of the last frame
+    gather: KeptGather
+    known: Irradiance | None = None
+    renewed: Bool | None = None  # (n,) texels that see anything anew since the last frame
     inputs: _Inputs | None = None
     light: Light | None = None
     schedule: UpdateSchedule | None = None  # of live frames
     waiting: Bool | None = None  # (n,) texels that the last live frame left pending
 
 
-class Lighting:
-    """The links of one bake, for each number of rays that its frames ask for."""
+#: Makes a gather of a frame's scene with so many samples, that may keep so many bytes.
+MakeGather = Callable[[PlacedScene, SampleCounts, int], KeptGather]
 
-    def __init__(
-        self, settings: BakeSettings, bright: BrightTargets, workers: Workers, live: LiveSettings | None = None
-    ) -> None:
-        """``live``: after the first frame each one brings only some texels' links up to date."""
-        self._settings, self._bright, self._workers, self._live = settings, bright, workers, live
+
+class Lighting:
+    """The gathers of one bake, one for each number of samples that its frames ask for."""
+
+    def __init__(self, settings: BakeSettings, make_gather: MakeGather, live: LiveSettings | None = None) -> None:
+        """``live``: after the first frame each one brings only some texels up to date."""
+        self._settings, self._make_gather, self._live = settings, make_gather, live
         self._kept: dict[SampleCounts, _Kept] = {}
         self._used: set[SampleCounts] = set()
-        self._rays: dict[SampleCounts, GatherRays] = {}
 
     def forget(self) -> None:
         """Keep nothing: the next frame starts from scratch."""
-        self._kept.clear()
-        self._rays.clear()
+        self._keep(set())
+
+    def _keep(self, wanted: set[SampleCounts]) -> None:
+        for samples, kept in self._kept.items():
+            if samples not in wanted:
+                kept.gather.release()
+        self._kept = {samples: kept for samples, kept in self._kept.items() if samples in wanted}
 
     def follow(self, placed: PlacedScene, change: Change, stats: FrameStats) -> None:
-        """Mark the links that ``change`` disturbs, once a frame; those the frame before did not use are dropped."""
-        self._kept = {samples: kept for samples, kept in self._kept.items() if samples in self._used}
-        self._rays = {samples: rays for samples, rays in self._rays.items() if samples in self._used}
+        """Mark what ``change`` disturbs, once a frame; gathers that the frame before did not use are dropped."""
+        self._keep(self._used if change.rays_hold else set())
         self._used = set()
-        if not change.rays_hold:
-            self.forget()
-        for rays in self._rays.values():
-            rays.follow(change.texels, placed.surfaces)
-        if not change.sweep.any:
-            return
-        for samples, kept in self._kept.items():
-            stats.links_tested += kept.store.disturb(
-                self._gather_rays(placed, samples), change.sweep, placed.frame.reach
-            )
+        for kept in self._kept.values():
+            stats.links_tested += kept.gather.follow(placed, change)
 
-    def links(self, placed: PlacedScene, samples: SampleCounts, stats: FrameStats) -> Links:
-        """The links of ``samples`` rays a texel, up to date."""
+    def gather(self, placed: PlacedScene, samples: SampleCounts, stats: FrameStats) -> Irradiance:
+        """What all texels see by ``samples``, up to date."""
         kept = self._kept.get(samples)
         if kept is None:
-            memory = (self._settings.link_memory << 20) - sum(k.store.bytes for k in self._kept.values())
-            store = LinkStore(self._gather_rays(placed, samples), self._workers, memory=max(memory, 0))
-            kept = self._kept[samples] = _Kept(store)
+            memory = (self._settings.link_memory << 20) - sum(k.gather.bytes for k in self._kept.values())
+            kept = self._kept[samples] = _Kept(self._make_gather(placed, samples, max(memory, 0)))
         self._used.add(samples)
-        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
-        pending = np.nonzero(kept.store.pending)[0].astype(np.int32)
-        if kept.links is not None and not len(pending):
-            kept.renewed = np.zeros(kept.store.count, np.bool_)
-            stats.links_kept += kept.store.target.size
-            return kept.links
-        rays = self._gather_rays(placed, samples)
-        kept.renewed, renewed = np.zeros(kept.store.count, np.bool_), 0
+        gather = kept.gather
+        kept.renewed, renewed = np.zeros(gather.count, np.bool_), 0
+        pending = np.nonzero(gather.pending)[0].astype(np.int32)
+        if kept.known is not None and not len(pending):
+            stats.links_kept += gather.samples_kept
+            return kept.known
         for texels in self._line(placed, kept, pending):
-            work = kept.store.renew(rays, texels)
+            work = gather.renew(texels)
             kept.renewed |= work.changed
             renewed += work.renewed
             stats.rays += work.traced
+            stats.views_drawn += work.drawn
         stats.links_traced += renewed
-        stats.links_kept += kept.store.target.size - renewed
-        stats.texels_pending = int(np.count_nonzero(kept.store.pending))
-        kept.links = make_links(kept.store, rays, self._workers)
-        return kept.links
+        stats.links_kept += gather.samples_kept - renewed
+        stats.texels_pending = int(np.count_nonzero(gather.pending))
+        kept.known = gather.irradiance()
+        return kept.known
 
     def _line(self, placed: PlacedScene, kept: _Kept, pending: Int32) -> Iterator[Int32]:
         """The ``pending`` texels to bring up to date now, in parts: all, or what a live frame's budget allows."""
@@ -136,10 +127,10 @@ class Lighting:
             threshold, patience = self._live.threshold, self._live.patience
             kept.schedule = UpdateSchedule(texels.surface, area, threshold=threshold, patience=patience)
         kept.schedule.set_area(area)
-        fresh = pending[pending < kept.store.kept]
+        fresh = pending[pending < kept.gather.kept]
         fresh = fresh if kept.waiting is None else fresh[~kept.waiting[fresh]]
         sent = radiosity.sent_by_targets(light.aim, placed.albedo, placed.emitted).max(axis=1)
-        flux = kept.store.at_stake(sent, fresh) * placed.frame.area[fresh]
+        flux = kept.gather.at_stake(sent, fresh) * placed.frame.area[fresh]
         of_surface = np.bincount(texels.surface[fresh], flux, minlength=texels.surface_count)
         kept.schedule.add(np.asarray(of_surface, np.float64))
         waits = np.zeros(texels.count, np.bool_)
@@ -151,14 +142,19 @@ class Lighting:
         kept.waiting = waits
 
     def light(
-        self, placed: PlacedScene, links: Links, samples: SampleCounts, outside: Float32, aim: Float32 | None = None
+        self,
+        placed: PlacedScene,
+        links: Irradiance,
+        samples: SampleCounts,
+        outside: Float32,
+        aim: Float32 | None = None,
     ) -> Light:
         """AIM and IIM; ``outside`` (n, 3) W/m² comes by other ways than links.
 
         ``aim`` (n, 3): all light as photons tell it; without it the AIM is radiosity's fixed point.
         """
         kept = self._kept[samples]
-        component, coupled = kept.store.components()
+        component, coupled = kept.gather.components()
         other = self._with_emitted(kept, links, placed.emitted, outside)
         now = _Inputs(links, component, outside, other, placed.albedo, placed.emitted, aim)
         surface = placed.texels.surface
@@ -166,13 +162,13 @@ class Lighting:
         if kept.inputs is not None and kept.renewed is not None:
             stale = _stale(kept.inputs, now, kept.renewed, surface)
         texels = np.nonzero(stale)[0]
-        if len(texels) and kept.store.kept < kept.store.count:
+        if len(texels) and kept.gather.kept < kept.gather.count:
             texels = np.arange(len(stale))  # links that are not kept are traced for all or none
         light = self._solved(now, kept.light, texels, np.where(coupled, component, -1)[surface])
         kept.inputs, kept.light = now, replace(light, updated=stale)
         return kept.light
 
-    def _with_emitted(self, kept: _Kept, links: Links, emitted: Float32, outside: Float32) -> Float32:
+    def _with_emitted(self, kept: _Kept, links: Irradiance, emitted: Float32, outside: Float32) -> Float32:
         """(n, 3) all irradiance but what texels send back; the array of the last frame where nothing differs."""
         before = kept.inputs
         if before is not None and before.links is links and before.emitted is emitted and before.outside is outside:
@@ -196,14 +192,6 @@ class Lighting:
             aim[texels] = now.photon_aim[texels]
         iim[texels], half[texels] = links.with_half(radiosity.sent_by_targets(aim, now.albedo, now.emitted))
         return replace(before, aim=aim, iim=iim, half=half, stand_in=now.links.stand_in, component=now.component)
-
-    def _gather_rays(self, placed: PlacedScene, samples: SampleCounts) -> GatherRays:
-        if samples not in self._rays:
-            self._rays[samples] = GatherRays(
-                placed.texels, placed.frame, placed.geometry, placed.surfaces, placed.tracer, placed.sky,
-                self._bright, samples, max_specular=self._settings.max_specular, seed=self._settings.seed,
-            )  # fmt: skip
-        return self._rays[samples]
 
 
 def _stale(before: _Inputs, now: _Inputs, renewed: Bool, surface: Int32) -> Bool:

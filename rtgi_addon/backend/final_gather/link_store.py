@@ -8,8 +8,6 @@ whenever its light is asked for.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +18,7 @@ from ..surface.rasterise import POINTS
 from .beyond_store import BeyondStore
 from .components import SurfaceGraph
 from .gather import NO_TARGET, Beyond, GatherRays, TracedTexels
+from .kept_gather import GatherWork
 from .touched import Kept, touched_rays
 
 #: Target, weight and pending mark of a link; a cosine ray's length besides.
@@ -31,16 +30,6 @@ PARTS = 2
 MOST_PLACES = 12
 #: Fewer rays than this are not worth a second thread.
 LEAST_RAYS = 1 << 13
-
-
-@dataclass
-class LinkWork:
-    """What one frame's update of the links took."""
-
-    changed: Bool  # (n,) texels of which some link was traced anew
-    traced: int = 0  # rays
-    renewed: int = 0  # links
-    kept: int = 0  # links
 
 
 class LinkStore:
@@ -134,9 +123,9 @@ class LinkStore:
         self._workers.map_slices(part, len(texel), self.chunk)
         return out
 
-    def renew(self, rays: GatherRays, texel: Int32) -> LinkWork:
+    def renew(self, rays: GatherRays, texel: Int32) -> GatherWork:
         """Trace the pending links of ``texel`` (m,)."""
-        work = LinkWork(np.zeros(self.count, np.bool_))
+        work = GatherWork(np.zeros(self.count, np.bool_))
         texel = texel[self._pending_texel[texel]]
         inside = texel[texel < self.kept]
         some = ~self._pending[inside].all(axis=1)
@@ -144,7 +133,6 @@ class LinkStore:
         self._renew_texels(rays, np.concatenate([inside[~some], grown]), work)
         self._renew_texels(rays, texel[texel >= self.kept], work)
         work.changed[texel] = True
-        work.kept = self.target.size - work.renewed
         self._pending[inside] = False
         self._pending_texel[texel] = False
         beyond = self.beyond.all
@@ -175,7 +163,7 @@ class LinkStore:
             near[cut[(away * away).sum(axis=1) <= far * far]] = True
         return near
 
-    def _renew_rays(self, rays: GatherRays, texel: Int32, work: LinkWork) -> Int32:
+    def _renew_rays(self, rays: GatherRays, texel: Int32, work: GatherWork) -> Int32:
         """Trace the pending links of ``texel``, whose others stay; texels of which another part may be open now."""
         if not len(texel):
             return texel
@@ -227,7 +215,7 @@ class LinkStore:
 
         return sum(self._workers.map_slices(aimed, len(of), _even(len(of), CHUNK_RAYS, LEAST_RAYS)))
 
-    def _renew_texels(self, rays: GatherRays, texel: Int32, work: LinkWork) -> None:
+    def _renew_texels(self, rays: GatherRays, texel: Int32, work: GatherWork) -> None:
         """Trace all links of ``texel``."""
         if not len(texel):
             return

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..scene import Float32, Int32
-from .links import Links
+from .kept_gather import Irradiance
 from .solvers import solve_fixed_point
 
 #: Relative residual of the solution: far below the noise of any sample count.
@@ -21,7 +21,9 @@ TOLERANCE = 1e-4
 MOST_PRODUCTS = 200
 
 
-def solve(links: Links, texels: NDArray[np.int64], group: Int32, b: Float32, albedo: Float32, targets: int) -> Float32:
+def solve(
+    links: Irradiance, texels: NDArray[np.int64], group: Int32, b: Float32, albedo: Float32, targets: int
+) -> Float32:
     """(r, 3) the AIM of ``texels`` (r,) at radiosity's fixed point.
 
     links of those texels to all ``targets`` · group (r,): texels that exchange light have one number, those that
