@@ -7,7 +7,7 @@ need to find what still holds.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -19,7 +19,10 @@ from .selection.sweep import Sweep
 from .surface.geometry import Geometry
 from .surface.scatter import Surfaces, diffuse_shares, make_surfaces
 from .surface.texels import TexelFrame, follow_texels, make_texels, place_texels, texel_colours
-from .surface.tracing import EmbreeTracer
+from .surface.tracing import EmbreeTracer, FollowingTracer
+
+#: Makes a tracer of a scene in the frame that its geometry and state stand in.
+MakeTracer = Callable[[Scene, Geometry, FrameState], FollowingTracer]
 
 
 class PlacedScene:
@@ -34,19 +37,26 @@ class PlacedScene:
     frame: TexelFrame
 
     def __init__(
-        self, scene: Scene, atlas: Atlas, state: FrameState, guide: Sequence[FrameState], workers: Workers
-    ) -> None:
-        """``state`` is the first frame; ``guide`` others of the same bake, whose skies it is ready for."""
-        self.scene = scene
+        self, scene: Scene, atlas: Atlas, state: FrameState, guide: Sequence[FrameState], workers: Workers,
+        make_tracer: MakeTracer | None = None,
+    ) -> None:  # fmt: skip
+        """``state`` is the first frame; ``guide`` others of the same bake, whose skies it is ready for.
+
+        ``make_tracer``: what traces rays; None: Embree.
+        """
+        self.scene, self.state, self.workers = scene, state, workers
         self.geometry = Geometry(scene, state)
-        self.tracer = EmbreeTracer(scene, self.geometry, state, workers)
+        self.trace_with(make_tracer)
         self.texels = make_texels(scene, atlas, self.geometry)
         self.frame = place_texels(self.texels, self.geometry)
         self._layout = sky_layout(s.world for s in (state, *guide))
-        self.workers = workers
-        self.state = state
         self._colour(state)
         self._shine(state)
+
+    def trace_with(self, make_tracer: MakeTracer | None) -> None:
+        """Another tracer from now on: rays that are kept must be forgotten."""
+        of_frame = self.scene, self.geometry, self.state
+        self.tracer: FollowingTracer = make_tracer(*of_frame) if make_tracer else EmbreeTracer(*of_frame, self.workers)
 
     def follow(self, state: FrameState) -> Change:
         """Bring everything to ``state``; what differs from the frame before."""

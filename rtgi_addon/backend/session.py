@@ -17,17 +17,19 @@ import numpy as np
 from .final_gather import radiosity
 from .final_gather.bright import BrightTargets, bright_targets, bright_weight
 from .final_gather.components import SurfaceGraph
-from .final_gather.lighting import Light, Lighting, MakeGather
-from .final_gather.link_gather import LinkGather
+from .final_gather.gathers import Gathers
+from .final_gather.lighting import Light, Lighting
 from .final_gather.rooms import look_around, rooms_of
+from .final_gather.view_gather import view_size
 from .finish.finisher import Finisher, OidnOpening, fill
+from .gpu.context import GpuFailed
 from .limits import bounded_scene, bounded_state
 from .outside import OutsideLight
 from .parallel import Workers
 from .placed import PlacedScene
 from .progress import Report, silent
 from .scene import Atlas, Bool, Float32, FrameState, LightMaps, Scene
-from .settings import BakeSettings, LiveSettings, SampleCounts, Selection
+from .settings import BakeSettings, Gather, LiveSettings, SampleCounts, Selection
 from .stats import FrameStats
 from .surface.geometry import Geometry
 from .surface.texels import Texels
@@ -91,14 +93,26 @@ class Session:
         self._report = report
         oidn = OidnOpening(settings, oidn_paths)
         self._workers = Workers(settings.threads)
-        self._placed = PlacedScene(scene, atlas, states[0], states[1:], self._workers)
-        self._outside = OutsideLight(self._placed, atlas, settings)
+        self._gathers = Gathers(settings, self._workers)
         self._live = live
-        self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
         self._broken = False  # a frame was cut short: what is kept may be of two frames
+        try:
+            self._set_up(states)
+        except GpuFailed as fault:
+            self._gathers.give_up(fault)
+            self._set_up(states)
+        self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
+
+    def _set_up(self, states: Sequence[FrameState]) -> None:
+        """Place the scene and settle what gather rays are aimed at."""
+        self._placed = PlacedScene(
+            self.scene, self.atlas, states[0], states[1:], self._workers, self._gathers.make_tracer
+        )
+        self._outside = OutsideLight(self._placed, self.atlas, self.settings)
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
-        self._lighting = Lighting(settings, self._link_gather(self._guide(states[1:] or states)), live)
+        self._gathers.choose(self._guide(states[1:] or states))
+        self._lighting = Lighting(self.settings, self._gathers.make, self._live)
 
     @property
     def texels(self) -> Texels:
@@ -111,8 +125,9 @@ class Session:
         return self._placed.geometry
 
     def close(self) -> None:
-        """Give threads and the denoiser back."""
+        """Give threads, the GPU and the denoiser back."""
         self._workers.close()
+        self._gathers.close()
         self._finisher.close()
 
     def __enter__(self) -> Session:
@@ -124,7 +139,15 @@ class Session:
         self.close()
 
     def advance(self, state: FrameState) -> FrameResult:
-        """Light the frame ``state``."""
+        """Light the frame ``state``. Where the GPU fails meanwhile, it is lit once more, by the CPU."""
+        try:
+            return self._advance(state)
+        except GpuFailed as fault:
+            self._gathers.give_up(fault)
+            self._placed.trace_with(self._gathers.make_tracer)
+            return self._advance(state)
+
+    def _advance(self, state: FrameState) -> FrameResult:
         if self._broken:
             self._forget()
             self._placed.place_again()
@@ -132,7 +155,8 @@ class Session:
         stats, self._setup = self._setup or FrameStats(), None
         traced_in_setup, stats.photons_kept = stats.photons_traced, 0
         state, bounded = bounded_state(state, self.scene)
-        stats.warnings += dict.fromkeys([*self._bounded, *bounded])
+        stats.warnings += dict.fromkeys([*self._gathers.warnings(self._placed), *self._bounded, *bounded])
+        stats.gather, stats.gather_reason = self._gathers.gather, self._gathers.reason
         with stats.stage("place"):
             change = self._placed.follow(state)
             if self.settings.selection is Selection.OFF:
@@ -184,7 +208,10 @@ class Session:
     def _illuminate(self, outside: Float32, samples: SampleCounts, stats: FrameStats) -> _Lit:
         """Links with ``samples``, the light they bring, and how far it may be off."""
         placed, lighting = self._placed, self._lighting
-        stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
+        if self._gathers.gather is Gather.LINKS:
+            stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
+        else:
+            stats.view_pixels = view_size(samples)
         with stats.stage("links"):
             links = lighting.gather(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
@@ -224,17 +251,6 @@ class Session:
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
             weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
         return bright_targets(weights, rooms_of(seen, self.texels.surface))
-
-    def _link_gather(self, bright: BrightTargets) -> MakeGather:
-        settings = self.settings
-
-        def make(placed: PlacedScene, samples: SampleCounts, memory: int) -> LinkGather:
-            return LinkGather(
-                placed, bright, samples, self._workers,
-                memory=memory, max_specular=settings.max_specular, seed=settings.seed,
-            )  # fmt: skip
-
-        return make
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end, stand_in = self._finisher, lit.light.stand_in

@@ -19,13 +19,19 @@ class Quality(StrEnum):
 class Gather(StrEnum):
     """Which final gather computes the IIM."""
 
-    AUTO = "auto"
-    LINKS = "links"
+    AUTO = "auto"  # what meets the error asked soonest on this machine
+    LINKS = "links"  # rays by the cosine and at what is bright, kept as a sparse matrix
+    PLANE = "plane"  # the scene drawn on one plane before each texel (Larsen04 §4); leaves out grazing light
+    HEMICUBE = "hemicube"  # the scene drawn on half a cube about each texel (Cohen and Greenberg 1985)
+    RAYS = "rays"  # rays by the cosine, traced and summed on the GPU; needs OpenGL 4.3
 
 
 class Device(StrEnum):
+    """What traces and draws. Without OpenGL that serves, GPU goes on with the CPU, and says so."""
+
     AUTO = "auto"
     CPU = "cpu"
+    GPU = "gpu"
 
 
 class Caustics(StrEnum):
@@ -87,6 +93,10 @@ def _setting(default: Any, help_text: str, low: float | None = None, high: float
     return field(default=default, metadata={"help": help_text, "low": low, "high": high})
 
 
+#: Gathers that need OpenGL.
+GPU_GATHERS = (Gather.PLANE, Gather.HEMICUBE, Gather.RAYS)
+
+
 @dataclass(frozen=True)
 class BakeSettings:
     """All settings of a bake. Immutable; ``dataclasses.replace`` makes variants."""
@@ -97,6 +107,10 @@ class BakeSettings:
     target_error: float | None = _setting(None, "stop at this relative RMS error of the IIM, 0.04 is 4 %", 0.002, 1.0)
     gather: Gather = _setting(Gather.AUTO, "final gather method")
     device: Device = _setting(Device.AUTO, "where to compute")
+    enlargement: float = _setting(2.0, "gather plane: its half side, in distances from the texel", 1.0, 16.0)
+    stand_in_triangles: int = _setting(
+        4096, "gather plane and hemicube: meshes of more triangles are seen as simplified ones; 0: never", 0, 2**30
+    )
     caustics: Caustics = _setting(Caustics.AUTO, "light that reaches a wall by mirror or glass")
     aim_direct: AimDirect = _setting(AimDirect.SHADOW_RAYS, "direct part of the AIM")
     aim_bounced: AimBounced = _setting(AimBounced.AUTO, "bounced part of the AIM")
@@ -125,6 +139,8 @@ class BakeSettings:
             value, low, high = getattr(self, f.name), f.metadata["low"], f.metadata["high"]
             if value is not None and low is not None and not low <= value <= high:
                 raise ValueError(f"{f.name} = {value}: must lie in [{low}, {high}]")
+        if self.device is Device.CPU and self.gather in GPU_GATHERS:
+            raise ValueError(f"gather = {self.gather}: is done by a GPU; leave the device to auto, or choose links")
 
     @property
     def samples(self) -> SampleCounts:

@@ -29,6 +29,8 @@ class FrameStats:
     surfaces_updated: int = 0
     surfaces_kept: int = 0
     gather: str = "links"
+    gather_reason: str = ""  # why this one
+    view_pixels: int = 0  # along a side of a view, of gathers that draw
     cosine_rays: int = 0  # per texel
     bright_rays: int = 0  # per texel
     estimated_error: float | None = None  # relative RMS error of the IIM; None where the IIM is black

@@ -126,34 +126,91 @@ class Movement:
     rebuilt: bool = False  # what was said to stay put did not: nothing known about any ray holds
 
 
-class EmbreeTracer:
-    """The :class:`Tracer` by Embree over a :class:`Geometry`, which it follows from frame to frame."""
+class FollowingTracer(Tracer, Protocol):
+    """A :class:`Tracer` that follows a geometry from frame to frame."""
 
-    def __init__(self, scene: Scene, geometry: Geometry, state: FrameState, workers: Workers) -> None:
+    def update(self, state: FrameState, changed: list[int]) -> Movement:
+        """Follow the geometry after its own update, which returned ``changed``."""
+        ...
+
+
+class Movers:
+    """Which instances rays can hit, and where those that move stand; follows a :class:`Geometry` frame by frame."""
+
+    def __init__(self, scene: Scene, geometry: Geometry, state: FrameState) -> None:
         self._scene = scene
         self._geometry = geometry
-        self._workers = workers
         # One for all parts: each takes a slot of the process, of which Linux has 1024, and then crashes.
-        self._device = EmbreeDevice()
+        self.device = EmbreeDevice()
         self._visible: Bool = state.visible.copy()
-        self._still = self._build_still()
-        self._movers = {i: self._place(i, state, None) for i in self._present(moving=True)}
+        self.places: dict[int, Place] = {i: self._place(i, state, None) for i in self._present(moving=True)}
 
     def update(self, state: FrameState, changed: list[int]) -> Movement:
         """Follow ``geometry`` after its own update, which returned ``changed``."""
         switched = np.nonzero(state.visible != self._visible)[0].tolist()
         self._visible = state.visible.copy()
         rebuilt = any(not self._moves(i) for i in [*changed, *switched])
-        if rebuilt:
-            self._still = self._build_still()
-        before, moved = self._movers, set(changed)
-        self._movers = {
+        before, moved = self.places, set(changed)
+        self.places = {
             i: before[i] if i in before and i not in moved else self._place(i, state, before.get(i))
             for i in self._present(moving=True)
         }
-        other = [i for i in sorted(before.keys() | self._movers.keys()) if before.get(i) is not self._movers.get(i)]
-        left, taken = (tuple(places[i] for i in other if i in places) for places in (before, self._movers))
+        other = [i for i in sorted(before.keys() | self.places.keys()) if before.get(i) is not self.places.get(i)]
+        left, taken = (tuple(places[i] for i in other if i in places) for places in (before, self.places))
         return Movement(left, taken, rebuilt)
+
+    def still_triangles(self) -> Int32:
+        """(k,) those of the instances that stay put."""
+        rows = [np.arange(s.start, s.stop) for s in map(self._geometry.triangles_of, self._present(moving=False))]
+        return np.concatenate(rows or [np.zeros(0)]).astype(np.int32)
+
+    def _moves(self, index: int) -> bool:
+        instance = self._scene.instances[index]
+        return instance.moving or instance.deforming
+
+    def _present(self, *, moving: bool) -> list[int]:
+        """Instances that rays can hit and that have triangles."""
+        return [
+            i
+            for i, instance in enumerate(self._scene.instances)
+            if instance.blocks_light
+            and self._visible[i]
+            and self._moves(i) == moving
+            and self._geometry.triangles_of(i).start < self._geometry.triangles_of(i).stop
+        ]
+
+    def _place(self, index: int, state: FrameState, before: Place | None) -> Place:
+        """Where a mover stands; its triangles are built anew only where they deform."""
+        matrix = self._geometry.matrix_world[index]
+        inverse = np.linalg.pinv(matrix[:3, :3])  # a flat transform still gets an answer
+        shift = inverse @ (self._geometry.origin - matrix[:3, 3])
+        rows = self._geometry.triangles_of(index)
+        if before is not None and not self._scene.instances[index].deforming:
+            part = before.part
+        else:
+            corners = object_corners(self._scene, index, state)
+            # Float32 is finest about the middle; a mesh may lie a kilometre from its object's origin.
+            centre = _middle(_finite(corners))
+            part = replace(_part(self.device, corners - centre, np.arange(rows.start, rows.stop)), centre=centre)
+        part = replace(part, to_object=np.concatenate([inverse, (shift - part.centre)[:, None]], axis=1))
+        return Place(index, part, *_sphere(self._geometry.corners[rows], self._geometry))
+
+
+class EmbreeTracer:
+    """The :class:`Tracer` by Embree over a :class:`Geometry`, which it follows from frame to frame."""
+
+    def __init__(self, scene: Scene, geometry: Geometry, state: FrameState, workers: Workers) -> None:
+        self._geometry = geometry
+        self._workers = workers
+        self._movers = Movers(scene, geometry, state)
+        self._still = self._build_still()
+
+    def update(self, state: FrameState, changed: list[int]) -> Movement:
+        """Follow ``geometry`` after its own update, which returned ``changed``."""
+        movement = self._movers.update(state, changed)
+        if movement.rebuilt:
+            self._still = self._build_still()
+        return movement
 
     def intersect(self, origins: Float32, directions: Float32) -> Hits:
         chunks = self._workers.map_slices(lambda s: self._intersect(origins[s], directions[s]), len(origins))
@@ -179,45 +236,9 @@ class EmbreeTracer:
         )
         return np.concatenate(chunks) if chunks else np.zeros(0, np.uint8)
 
-    def _moves(self, index: int) -> bool:
-        instance = self._scene.instances[index]
-        return instance.moving or instance.deforming
-
-    def _present(self, *, moving: bool) -> list[int]:
-        """Instances that rays can hit and that have triangles."""
-        return [
-            i
-            for i, instance in enumerate(self._scene.instances)
-            if instance.blocks_light
-            and self._visible[i]
-            and self._moves(i) == moving
-            and self._geometry.triangles_of(i).start < self._geometry.triangles_of(i).stop
-        ]
-
     def _build_still(self) -> Part | None:
-        indices = self._present(moving=False)
-        if not indices:
-            return None
-        rows = np.concatenate([np.arange(s.start, s.stop) for s in map(self._geometry.triangles_of, indices)])
-        return _part(self._device, self._geometry.corners[rows], rows)
-
-    def _place(self, index: int, state: FrameState, before: Place | None) -> Place:
-        """Where a mover stands; its triangles are built anew only where they deform."""
-        matrix = self._geometry.matrix_world[index]
-        inverse = np.linalg.pinv(matrix[:3, :3])  # a flat transform still gets an answer
-        shift = inverse @ (self._geometry.origin - matrix[:3, 3])
-        rows = self._geometry.triangles_of(index)
-        if before is not None and not self._scene.instances[index].deforming:
-            part = before.part
-        else:
-            mesh_index = self._scene.instances[index].mesh
-            mesh = self._scene.meshes[mesh_index]
-            corners = state.vertices.get(mesh_index, mesh.vertices)[mesh.triangles]
-            # Float32 is finest about the middle; a mesh may lie a kilometre from its object's origin.
-            centre = _middle(_finite(corners))
-            part = replace(_part(self._device, corners - centre, np.arange(rows.start, rows.stop)), centre=centre)
-        part = replace(part, to_object=np.concatenate([inverse, (shift - part.centre)[:, None]], axis=1))
-        return Place(index, part, *_sphere(self._geometry.corners[rows], self._geometry))
+        rows = self._movers.still_triangles()
+        return _part(self._movers.device, self._geometry.corners[rows], rows) if len(rows) else None
 
     def _intersect(self, origins: Float32, directions: Float32) -> Hits:
         count = len(origins)
@@ -229,7 +250,7 @@ class EmbreeTracer:
             triangle = self._still.triangle_of_primitive.take(found["primID"], mode="clip")
             triangle[found["primID"] < 0] = -1
             u, v, distance = found["u"], found["v"], found["tfar"]
-        for place in self._movers.values():
+        for place in self._movers.places.values():
             near = place.near(origins, directions, distance)
             o, d = place.part.rays(origins[near], directions[near])
             found = place.part.embree.run(o, d, dists=distance[near], output=True)
@@ -237,25 +258,36 @@ class EmbreeTracer:
             rows = near[met]
             triangle[rows] = place.part.triangle_of_primitive[found["primID"][met]]
             u[rows], v[rows], distance[rows] = found["u"][met], found["v"][met], found["tfar"][met]
-        if not self._geometry.triangle_count:
-            return Hits(triangle, u, v, distance, np.zeros(count, np.float32))
-        normals = self._geometry.normals.take(triangle, axis=0, mode="clip")
-        return Hits(triangle, u, v, distance, dot(normals, directions))
+        return Hits(triangle, u, v, distance, cosines(self._geometry, triangle, directions))
 
     def _blocked(self, origins: Float32, directions: Float32, distances: Float32) -> UInt8:
         blocked = np.zeros(len(origins), np.uint8)
         if self._still is not None:
             blocked[self._still.occluded(origins, directions, distances)] = WALL
-        if not self._movers:
+        if not self._movers.places:
             return blocked
         free = np.flatnonzero(blocked == FREE)
         origins, directions, distances = origins[free], directions[free], distances[free]
-        for place in self._movers.values():
+        for place in self._movers.places.values():
             near = place.near(origins, directions, distances)
             near = near[blocked[free[near]] == FREE]
             met = place.part.occluded(origins[near], directions[near], distances[near])
             blocked[free[near[met]]] = MOVER
         return blocked
+
+
+def cosines(geometry: Geometry, triangle: Int32, directions: Float32) -> Float32:
+    """(n,) what :attr:`Hits.cosine` holds of rays that hit ``triangle`` (n,), -1 where they escaped."""
+    if not geometry.triangle_count:
+        return np.zeros(len(triangle), np.float32)
+    return dot(geometry.normals.take(triangle, axis=0, mode="clip"), directions)
+
+
+def object_corners(scene: Scene, index: int, state: FrameState) -> Float32:
+    """(t, 3, 3) corners of an instance's triangles, object space."""
+    number = scene.instances[index].mesh
+    mesh = scene.meshes[number]
+    return np.asarray(state.vertices.get(number, mesh.vertices)[mesh.triangles])
 
 
 def _part(device: Any, corners: Float32 | Float64, rows: Any) -> Part:

@@ -1,0 +1,314 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The gather by views: what each texel sees is drawn once, kept on the GPU, and summed for whatever light there is.
+
+Drawn again is what a moved object may be seen in: views of texels before which it was or is. With still geometry and
+moving lamps nothing is drawn. What does not fit the memory allowed is drawn anew for every product.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gpu.context import Gpu
+from ..parallel import CHUNK_RAYS, Workers
+from ..placed import PlacedScene
+from ..sampling import dot, frames, hash_keys, unit_float32
+from ..scene import Bool, Float32, Int32
+from ..selection.changes import Change
+from ..settings import SampleCounts
+from ..surface.rasterise import POINTS
+from ..surface.texels import stand_ins
+from .bright import BrightTargets
+from .coarse import CoarseMesh
+from .gather import GatherRays
+from .kept_gather import GatherWork
+from .links import MOST_HALF_SCALE
+from .openness import open_texels
+from .patterns import TILE, pattern_of_texels
+from .view_raster import Eyes, Target, ViewRaster
+from .view_sums import ViewSums
+from .view_tables import NOTHING, make_entries
+from .views import LEAST_SIZE, MOST_SIZE, View
+
+#: Rays of a texel that tell which of its points lie in the open.
+PROBES = SampleCounts(32, 0)
+#: Sides of a target, pixels: software draws fastest into what stays in a core's cache.
+SOFTWARE_SIDE, HARDWARE_SIDE = 1024, 4096
+#: Normals of a flat texel's points, and of a texel and its triangle, differ by less.
+FLAT = np.float32(1e-4)
+
+
+def view_size(samples: SampleCounts) -> int:
+    """Pixels along a view that stand for ``samples`` rays: 16, 32, 64 for draft, preview, final."""
+    size = 1 << int(np.ceil(np.log2(4 * np.sqrt(samples.total)) - 1e-9))
+    return min(max(size, LEAST_SIZE), MOST_SIZE)
+
+
+class ViewGather:
+    """The :class:`~.kept_gather.KeptGather` by views. All calls from one thread."""
+
+    def __init__(
+        self, placed: PlacedScene, gpu: Gpu, view: View, workers: Workers,
+        *, memory: int, coarse: dict[int, CoarseMesh], seed: int,
+    ) -> None:  # fmt: skip
+        """Nothing is drawn yet. ``memory``: bytes that views may take · ``coarse``: stand-ins by mesh.
+
+        Raises GpuFailed where the scene does not fit the device, here and in every call.
+        """
+        self._placed, self._gpu, self._view, self._workers = placed, gpu, view, workers
+        texels = placed.texels
+        self._probe = GatherRays(
+            texels, placed.frame, placed.geometry, placed.surfaces, placed.tracer, placed.sky, nothing_bright(placed),
+            PROBES, max_specular=0, seed=seed,
+        )  # fmt: skip
+        self._turn = _turns(pattern_of_texels(texels.page, texels.row, texels.col, seed), seed)
+        self._entries = make_entries(texels, placed.sky)
+        self._source = ViewRaster(gpu, view, placed.geometry, texels, placed.state, self._entries, coarse)
+        self._sums = ViewSums(gpu, view, self._entries.count)
+        self._open = _Opened(texels.count)
+        self._pending = np.ones(texels.count, np.bool_)
+        self._targets = self._make_targets(memory)
+        self._spare: _ViewTarget | None = None
+
+    @property
+    def count(self) -> int:
+        return len(self._pending)
+
+    @property
+    def kept(self) -> int:
+        return min(self.count, sum(t.target.tiles for t in self._targets))
+
+    @property
+    def samples_kept(self) -> int:
+        """None that are counted: see ``FrameStats.views_drawn``."""
+        return 0
+
+    @property
+    def bytes(self) -> int:
+        return sum(t.target.bytes for t in self._targets)
+
+    @property
+    def pending(self) -> Bool:
+        return self._pending.copy()
+
+    def follow(self, placed: PlacedScene, change: Change) -> int:
+        self._probe.follow(change.texels, placed.surfaces)
+        if not change.sweep.any:
+            return 0
+        self._source.follow(np.flatnonzero(change.sweep.moved), placed.state)
+        self._pending |= change.texels
+        frame = placed.frame
+        for place in change.sweep.places:
+            away = place.centre.astype(np.float32) - frame.position
+            self._pending |= dot(away, frame.normal) + np.float32(place.radius) + frame.reach > 0
+        return 0
+
+    def renew(self, texel: Int32) -> GatherWork:
+        work = GatherWork(np.zeros(self.count, np.bool_))
+        texel = texel[self._pending[texel]]
+        parts = self._workers.map_slices(
+            lambda rows: self._look(texel[rows]), len(texel), max(1, CHUNK_RAYS // PROBES.total)
+        )
+        work.traced, work.drawn = sum(parts), len(texel)
+        work.changed[texel] = True
+        first = 0
+        for kept in self._targets:
+            mine = texel[(texel >= first) & (texel < first + kept.target.tiles)]
+            kept.draw(self._source, mine - first, self._eyes(mine), self._tilt(mine))
+            first += kept.target.tiles
+        self._pending[texel] = False
+        return work
+
+    def at_stake(self, brightness: Float32, texel: Int32) -> Float32:
+        sent = np.broadcast_to(brightness[:, None], (len(brightness), 3)).astype(np.float32)
+        return np.ascontiguousarray(self.irradiance().irradiance(sent)[texel, 0])
+
+    def components(self) -> tuple[Int32, Bool]:
+        """One: which surfaces a view shows is known to the GPU alone."""
+        count = self._placed.texels.surface_count
+        return np.zeros(count, np.int32), np.ones(count, np.bool_)
+
+    def irradiance(self) -> ViewIrradiance:
+        texels = self._placed.texels
+        stand_in = stand_ins(texels, open_texels(texels, self._open.free))
+        patches = np.arange(self._probe.target_count - self.count, dtype=np.int32) + np.int32(self.count)
+        themselves = np.arange(self.count, dtype=np.int32)
+        shown = None
+        if not np.array_equal(stand_in, themselves):
+            shown = np.concatenate([np.where(stand_in < 0, np.int32(NOTHING), stand_in), patches])
+        return ViewIrradiance(stand_in, self, shown, themselves)
+
+    def release(self) -> None:
+        for kept in (*self._targets, self._spare):
+            if kept is not None:
+                kept.release()
+        self._source.release()
+        self._sums.release()
+
+    def products(self, radiosity: Float32, seen_as: Int32 | None, texels: NDArray[np.int64]) -> tuple[Float32, Float32]:
+        """((r, 4), (r, 4)) what each half of the pixels brings to ``texels`` (r,), rising, and its weight."""
+        self._sums.send(self._entries.sent(radiosity, seen_as))
+        halves = np.zeros((2, len(texels), 4), np.float32)
+        first = 0
+        for kept in self._targets:
+            rows = slice(*np.searchsorted(texels, [first, first + kept.target.tiles]))
+            if rows.start < rows.stop:
+                for half, sums in zip(halves, self._sums.sums(kept.target, kept.triangle), strict=True):
+                    half[rows] = sums[texels[rows] - first]
+            first += kept.target.tiles
+        for at in range(int(np.searchsorted(texels, first)), len(texels), max(1, self._spare_tiles())):
+            rows = slice(at, min(at + self._spare_tiles(), len(texels)))
+            for half, sums in zip(halves, self._drawn_again(texels[rows].astype(np.int32)), strict=True):
+                half[rows] = sums
+        return halves[0], halves[1]
+
+    def _spare_tiles(self) -> int:
+        return self._targets[0].target.tiles if self._targets else self._fitting(self.count).tiles
+
+    def _drawn_again(self, texel: Int32) -> list[Float32]:
+        """Of views that are not kept: drawn for this product alone."""
+        if self._spare is None:
+            self._spare = _ViewTarget(self._gpu, self._fitting(self.count), self._tilted)
+        tile = np.arange(len(texel), dtype=np.int32)
+        self._spare.draw(self._source, tile, self._eyes(texel), self._tilt(texel))
+        return [sums[: len(texel)] for sums in self._sums.sums(self._spare.target, self._spare.triangle)]
+
+    def _make_targets(self, memory: int) -> list[_ViewTarget]:
+        """As many as the texels need and ``memory`` holds."""
+        self._tilted = bool(np.any(np.abs(self._placed.frame.normal - self._placed.frame.geometric_normal) > FLAT))
+        shape = self._fitting(self.count)
+        each = 4 * shape.tiles * self._view.width * self._view.height
+        number = min(-(-self.count // shape.tiles), memory // each)
+        return [_ViewTarget(self._gpu, shape, self._tilted) for _ in range(number)]
+
+    def _fitting(self, count: int) -> _Shape:
+        """Tiles across and down a target; no larger than ``count`` texels need."""
+        side = min(SOFTWARE_SIDE if self._gpu.info.software else HARDWARE_SIDE, self._gpu.info.max_texture)
+        across = max(1, min(side // self._view.width, count))
+        return _Shape(self._view, across, max(1, min(side // self._view.height, -(-count // across))))
+
+    def _look(self, texel: Int32) -> int:
+        """Which points of ``texel`` (m,) lie in the open; rays traced."""
+        traced = self._probe.trace(texel)
+        self._open.points[texel], self._open.free[texel] = traced.opened, traced.free
+        return traced.rays
+
+    def _eyes(self, texel: Int32) -> Eyes:
+        """Where the views of ``texel`` (m,) are taken from: its middle, where it is flat and wholly in the open, else
+        the point in the open nearest to the middle of those."""
+        frame, texels = self._placed.frame, self._placed.texels
+        points, opened = frame.points[texel], self._open.points[texel]
+        share = opened / np.maximum(opened.sum(axis=1, keepdims=True), 1)
+        middle = np.asarray((points * share[:, :, None]).sum(axis=1), np.float32)
+        away = ((points - middle[:, None]) ** 2).sum(axis=2)
+        nearest = np.argmin(np.where(opened, away, np.float32(np.inf)), axis=1)
+        normals = self._placed.geometry.normals[texels.point_triangle[texel]]
+        flat = (np.abs(normals - normals[:, :1]) <= FLAT).all(axis=(1, 2)) & opened.all(axis=1)
+        eye = np.where(flat[:, None], middle, points[np.arange(len(texel)), nearest])
+        normal = frame.normal[texel]
+        tangent, bitangent = frames(normal)
+        cosine, sine = (f(self._turn[texel])[:, None].astype(np.float32) for f in (np.cos, np.sin))
+        return Eyes(eye, tangent * cosine + bitangent * sine, normal, texels.instance[texel])
+
+    def _tilt(self, texel: Int32) -> Float32 | None:
+        """(m, 4) normals of the own triangles of ``texel`` (m,), tangent space; None where no texel's is tilted."""
+        if not self._tilted:
+            return None
+        frame, eyes = self._placed.frame, self._eyes(texel)
+        own = frame.geometric_normal[texel]
+        across = np.cross(eyes.normal, eyes.tangent)
+        parts = [dot(own, eyes.tangent), dot(own, across.astype(np.float32)), dot(own, eyes.normal)]
+        return np.asarray(np.stack([*parts, np.zeros(len(texel), np.float32)], axis=1), np.float32)
+
+
+@dataclass(frozen=True)
+class ViewIrradiance:
+    """The :class:`~.kept_gather.Irradiance` by views, of r texels."""
+
+    stand_in: Int32
+    _gather: ViewGather
+    _seen_as: Int32 | None  # (m,) what each target is seen as, NOTHING: it does not count; None: as itself
+    _texels: NDArray[Any]  # (r,) rising
+
+    def irradiance(self, radiosity: Float32) -> Float32:
+        return self.with_half(radiosity)[0]
+
+    def with_half(self, radiosity: Float32) -> tuple[Float32, Float32]:
+        first, second = self._gather.products(radiosity, self._seen_as, self._texels)
+        whole = first + second
+        scale = _inverse(whole[:, 3:])
+        half_scale = np.minimum(_inverse(first[:, 3:]), scale * np.float32(MOST_HALF_SCALE))
+        return whole[:, :3] * scale, first[:, :3] * half_scale
+
+    def only(self, texels: NDArray[np.int64]) -> ViewIrradiance:
+        return replace(self, _texels=texels)
+
+
+@dataclass(frozen=True)
+class _Shape:
+    view: View
+    across: int
+    down: int
+
+    @property
+    def tiles(self) -> int:
+        return self.across * self.down
+
+
+class _ViewTarget:
+    """A target, and the triangles' normals of the texels in its tiles where they matter."""
+
+    def __init__(self, gpu: Gpu, shape: _Shape, tilted: bool) -> None:
+        self._gpu = gpu
+        self.target = Target(gpu, shape.view, shape.across, shape.down)
+        self.triangle: Any = None
+        self._up = np.zeros((shape.tiles, 4), np.float32)
+        if tilted:
+            with gpu.current() as ctx:
+                self.triangle = ctx.texture((shape.across, shape.down), 4, dtype="f4")
+                self.triangle.filter = (ctx.NEAREST, ctx.NEAREST)
+
+    def draw(self, source: ViewRaster, tile: Int32, eyes: Eyes, tilt: Float32 | None) -> None:
+        if not len(tile):
+            return
+        source.draw(self.target, tile, eyes)
+        if tilt is not None:
+            self._up[tile] = tilt
+            with self._gpu.current():
+                self.triangle.write(self._up.tobytes())
+
+    def release(self) -> None:
+        self.target.release()
+        self._gpu.release(self.triangle)
+
+
+class _Opened:
+    """What probes tell of n texels."""
+
+    def __init__(self, count: int) -> None:
+        self.points: Bool = np.ones((count, POINTS), np.bool_)  # which lie in the texel's open part
+        self.free: Float32 = np.ones(count, np.float32)  # share of rays that end on no dark side
+
+
+def nothing_bright(placed: PlacedScene) -> BrightTargets:
+    """Nothing to aim at."""
+    count = placed.texels.count + (placed.sky.count if placed.sky else 0)
+    none = np.zeros((1, count))
+    return BrightTargets(np.zeros(placed.texels.count, np.int32), none.astype(np.float32), np.zeros((1, count + 1)))
+
+
+def _turns(pattern: Int32, seed: int) -> Float32:
+    """(n,) rad: how far each texel's view is turned about its normal. A quarter brings a view's pixels back to where
+    they were; the texels of a tile divide one evenly, so that what the denoiser averages cancels."""
+    sets, within = np.divmod(pattern, TILE * TILE)
+    bits = np.array([int(f"{k:04b}"[::-1], 2) for k in range(TILE * TILE)])
+    share = bits[within] / (TILE * TILE) + unit_float32(hash_keys(sets, 5, seed))
+    return np.asarray(share % 1.0 * (np.pi / 2), np.float32)
+
+
+def _inverse(weight: Float32) -> Float32:
+    return np.divide(np.float32(1), weight, out=np.zeros_like(weight), where=weight > 0)

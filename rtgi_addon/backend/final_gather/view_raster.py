@@ -1,0 +1,337 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Views by drawing: the scene as it is seen from thousands of texels, each in a tile of one target (Larsen04 §4).
+
+One draw shows one face of many texels' views, an instance a texel. Drawn is what may lie before them: clusters of
+triangles behind all of them are left out, and large meshes are drawn as their stand-ins, but not before their own
+texels, which lie on the mesh itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..gpu.context import Gpu
+from ..gpu.pace import Pace
+from ..gpu.programs import draw_program, set_uniforms
+from ..gpu.triangles import Corners, SceneTriangles, corners_of_scene, farthest
+from ..scene import Bool, Float32, FrameState, Int32
+from ..surface.geometry import Geometry
+from ..surface.texels import Texels
+from .clusters import Clusters, cluster_spheres, in_front, make_clusters
+from .coarse import CoarseMesh
+from .view_tables import Entries
+from .views import View
+
+#: Depths are logarithms of the distance over this share of the largest: 24 bits tell a millionth of any distance apart.
+NEAR_SHARE = 1e-7
+#: Views of one draw: few enough that what lies behind all of them is left out, many enough to keep a GPU busy.
+LEAST_VIEWS, FIRST_VIEWS, MOST_VIEWS = 16, 256, 4096
+#: Ranges of triangles that are drawn apart; nearer ones are drawn with what lies between them.
+MOST_RANGES = 32
+GL_CLIP_DISTANCE0 = 0x3000
+#: An instance of a draw: eye, tangent, normal, tile.
+EYE = np.dtype([("eye", "f4", 3), ("tangent", "f4", 3), ("normal", "f4", 3), ("tile", "f4", 2)])
+
+
+@dataclass(frozen=True)
+class Eyes:
+    """Where m views are taken from; local space."""
+
+    eye: Float32  # (m, 3)
+    tangent: Float32  # (m, 3) unit
+    normal: Float32  # (m, 3) unit
+    instance: Int32  # (m,) on which the texel lies
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Eyes:
+        return Eyes(self.eye[rows], self.tangent[rows], self.normal[rows], self.instance[rows])
+
+
+class Target:
+    """An image of ``across`` × ``down`` tiles, each a view's pixels, each pixel an entry."""
+
+    def __init__(self, gpu: Gpu, view: View, across: int, down: int) -> None:
+        self._gpu, self.view, self.across, self.down = gpu, view, across, down
+        self.size = (across * view.width, down * view.height)
+        with gpu.current() as ctx:
+            self.texture: Any = ctx.texture(self.size, 1, dtype="u4")
+            self.texture.filter = (ctx.NEAREST, ctx.NEAREST)
+            self.depth: Any = None
+            self.framebuffer: Any = None
+
+    @property
+    def tiles(self) -> int:
+        return self.across * self.down
+
+    @property
+    def bytes(self) -> int:
+        """Of its entries, on the GPU."""
+        return 4 * self.size[0] * self.size[1]
+
+    def corners(self, tile: NDArray[np.integer[Any]]) -> Float32:
+        """(k, 2) left and bottom of the tiles (k,), pixels."""
+        row, column = np.divmod(tile, self.across)
+        return np.asarray(np.stack([column * self.view.width, row * self.view.height], axis=1), np.float32)
+
+    def release(self) -> None:
+        """Give its memory back."""
+        self._gpu.release(self.framebuffer, self.texture)
+
+
+@dataclass(frozen=True)
+class _Level:
+    """The triangles of one level of detail; cluster by cluster they are drawn."""
+
+    place: Int32  # (c, 3) where each corner is found in the geometry's corners
+    clusters: Clusters
+    offset: int  # of the first in the buffer of all
+
+
+@dataclass(frozen=True)
+class _Scenery:
+    """All clusters of all levels in one frame."""
+
+    centre: Float32  # (k, 3) of their spheres, local
+    radius: Float32  # (k,) m
+    instance: Int32  # (k,)
+    coarse: Bool  # (k,) of a stand-in
+    shown: Bool  # (k,)
+    begin: Int32  # (k,) first triangle in the buffer of all
+    end: Int32  # (k,)
+
+
+class ViewRaster:
+    """Draws views of one scene as it stands in the frame last given to :meth:`follow`."""
+
+    def __init__(
+        self, gpu: Gpu, view: View, geometry: Geometry, texels: Texels, state: FrameState, entries: Entries,
+        coarse: dict[int, CoarseMesh],
+    ) -> None:  # fmt: skip
+        """``coarse``: stand-ins by mesh. Raises GpuFailed where the scene does not fit the device."""
+        self._gpu, self._view, self._geometry, self._entries = gpu, view, geometry, entries
+        self._has_coarse = np.array([i.mesh in coarse for i in geometry.scene.instances], np.bool_)
+        full, small = corners_of_scene(geometry), _coarse_corners(geometry, coarse)
+        self._triangles = SceneTriangles(gpu, geometry, texels, state, _joined(full, small))
+        self._levels = _levels(geometry, full, small)
+        self._pace = Pace(LEAST_VIEWS, MOST_VIEWS, FIRST_VIEWS)
+        self._depths: dict[tuple[int, int], Any] = {}
+        self._open(texels)
+        self._mirrored = geometry.mirrored.copy()
+        self._write_indices()
+        self._scenery = self._look(state)
+
+    def follow(self, moved: NDArray[np.int64], state: FrameState) -> None:
+        """Bring the instances ``moved`` to where ``geometry`` has them, and show what ``state`` does."""
+        self._triangles.follow(moved, state)
+        if not np.array_equal(self._mirrored, self._geometry.mirrored):
+            self._mirrored = self._geometry.mirrored.copy()
+            self._write_indices()
+        self._scenery = self._look(state)
+
+    def draw(self, target: Target, tile: Int32, eyes: Eyes) -> None:
+        """Draw the views of ``eyes`` (k,) into the tiles (k,) of ``target``; all its others stay as they are."""
+        for rows in _alike(self._has_coarse, eyes.instance):
+            done = 0
+            while done < len(rows):
+                part = rows[done : done + self._pace.items]
+                with self._pace.timed(len(part)), self._gpu.current() as ctx:
+                    self._draw(ctx, target, target.corners(tile[part]), eyes.take(part))
+                    ctx.finish()
+                done += len(part)
+
+    def release(self) -> None:
+        """Give memory back."""
+        self._triangles.release()
+        vertex_arrays = (self._drawing, self._clearing)
+        self._gpu.release(*vertex_arrays, self._order, self._eyes, self._pixels, *self._depths.values())
+
+    def _open(self, texels: Texels) -> None:
+        """Programs and buffers."""
+        view, entries = self._view, self._entries
+        self._program, self._clear = draw_program(self._gpu, "view"), draw_program(self._gpu, "background")
+        with self._gpu.current() as ctx:
+            self._order = ctx.buffer(reserve=12 * max(self._triangles.count, 1))
+            self._eyes = ctx.buffer(reserve=MOST_VIEWS * EYE.itemsize)
+            self._drawing = ctx.vertex_array(
+                self._program,
+                [
+                    (self._triangles.placed, "3f", "in_position"),
+                    (self._triangles.corner_rows, "4f 2i", "in_pixel", "in_first"),
+                    (self._eyes, "3f 3f 3f 2f/i", "in_eye", "in_tangent", "in_normal", "in_tile"),
+                ],
+                index_buffer=self._order,
+            )
+            away = [(self._eyes, "12x 3f 3f 2f/i", "in_tangent", "in_normal", "in_tile")]
+            self._clearing = ctx.vertex_array(self._clear, away)
+            self._pixels = pixel_texture(ctx, view)
+            set_uniforms(self._program, resolution=texels.index.shape[1], none=entries.none)
+            set_uniforms(
+                self._clear, size=(view.width, view.height), view=0, sky_size=entries.sky_size,
+                sky_first=entries.sky_first, escaped=entries.escaped,
+            )  # fmt: skip
+
+    def _write_indices(self) -> None:
+        with self._gpu.current():
+            for level in self._levels:
+                if level.clusters.count:
+                    indices = self._triangles.indices(level.clusters.order + np.int32(level.offset))
+                    self._order.write(indices.tobytes(), offset=12 * level.offset)
+
+    def _look(self, state: FrameState) -> _Scenery:
+        """What is there to draw, and where."""
+        with self._gpu.current():
+            near = farthest(self._geometry) * NEAR_SHARE
+            set_uniforms(
+                self._program,
+                near=max(near, float(np.finfo(np.float32).tiny)), depth_scale=float(1 / np.log2(1 + 1 / NEAR_SHARE)),
+            )  # fmt: skip
+        shown = state.visible & np.array([i.blocks_light for i in self._geometry.scene.instances], np.bool_)
+        known = self._geometry.corners.reshape(-1, 3)
+        spheres = [cluster_spheres(known[level.place], level.clusters) for level in self._levels]
+        instance = np.concatenate([level.clusters.instance for level in self._levels])
+        return _Scenery(
+            centre=np.concatenate([centre for centre, _ in spheres]),
+            radius=np.concatenate([radius for _, radius in spheres]),
+            instance=instance,
+            coarse=np.concatenate([np.full(level.clusters.count, level.offset > 0) for level in self._levels]),
+            shown=shown[instance],
+            begin=np.concatenate([level.clusters.first[:-1] + level.offset for level in self._levels]),
+            end=np.concatenate([level.clusters.first[1:] + level.offset for level in self._levels]),
+        )
+
+    def _ranges(self, eyes: Eyes) -> list[tuple[int, int]]:
+        """(first triangle, their number) in the buffer of all that may lie before ``eyes``, which are of one instance
+        where that has a stand-in."""
+        scenery = self._scenery
+        as_is = (scenery.instance == eyes.instance[0]) | ~self._has_coarse[scenery.instance]
+        rows = np.flatnonzero(scenery.shown & (as_is != scenery.coarse))
+        rows = rows[in_front(scenery.centre[rows], scenery.radius[rows], eyes.eye, eyes.normal)]
+        return merged(scenery.begin[rows], scenery.end[rows])
+
+    def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes) -> None:
+        rows = np.zeros(len(corner), EYE)
+        rows["eye"], rows["tangent"], rows["normal"], rows["tile"] = eyes.eye, eyes.tangent, eyes.normal, corner
+        self._eyes.orphan()
+        self._eyes.write(rows.tobytes())
+        self._aim(ctx, target)
+        ctx.enable(ctx.DEPTH_TEST)
+        ctx.depth_func = "1"  # always: the background takes the place of what was there
+        self._pixels.use(0)
+        set_uniforms(self._clear, target=target.size)
+        self._clearing.render(ctx.TRIANGLE_STRIP, vertices=4, instances=len(rows))
+        ctx.depth_func = "<"
+        ctx.front_face = "cw"  # the picture looks along the normal with the tangent to the right: a mirror image
+        ranges = self._ranges(eyes)
+        with _clipped(ctx):
+            for face in self._view.faces:
+                set_uniforms(
+                    self._program, axes=tuple(face.axes.T.reshape(-1)), low=face.low, rectangle=face.rectangle,
+                    target=target.size,
+                )  # fmt: skip
+                for first, count in ranges:
+                    self._drawing.render(ctx.TRIANGLES, vertices=3 * count, first=3 * first, instances=len(rows))
+        ctx.disable(ctx.DEPTH_TEST)
+
+    def _aim(self, ctx: Any, target: Target) -> None:
+        """Draw to ``target`` from now on; targets of one size share their depths."""
+        if target.framebuffer is None:
+            if target.size not in self._depths:
+                self._depths[target.size] = ctx.depth_renderbuffer(target.size)
+            target.framebuffer = ctx.framebuffer([target.texture], self._depths[target.size])
+        target.framebuffer.use()
+
+
+def pixel_texture(ctx: Any, view: View) -> Any:
+    """Direction, tangent space, and weight of each pixel of ``view``."""
+    pixels = np.concatenate([view.directions, view.weights[:, :, None]], axis=2)
+    texture = ctx.texture((view.width, view.height), 4, np.ascontiguousarray(pixels).tobytes(), dtype="f4")
+    texture.filter = (ctx.NEAREST, ctx.NEAREST)
+    return texture
+
+
+def merged(begin: Int32, end: Int32) -> list[tuple[int, int]]:
+    """(first, count) of at most MOST_RANGES ranges that hold [begin, end) (k,): what touches is joined, and then what
+    lies nearest, with what is between."""
+    if not len(begin):
+        return []
+    order = np.argsort(begin, kind="stable")
+    begin, end = begin[order], end[order]
+    gap = begin[1:] - end[:-1]
+    apart = gap > 0
+    if np.count_nonzero(apart) >= MOST_RANGES:
+        apart = np.zeros(len(gap), np.bool_)
+        apart[np.argsort(-gap, kind="stable")[: MOST_RANGES - 1]] = True
+    first, last = begin[np.append(True, apart)], end[np.append(apart, True)]
+    return [(int(a), int(b - a)) for a, b in zip(first, last, strict=True)]
+
+
+def _alike(has_coarse: Bool, instance: Int32) -> Iterator[NDArray[np.int64]]:
+    """Rows of eyes before which the same levels of detail are drawn."""
+    key = np.where(has_coarse[instance], instance, np.int32(-1))
+    for own in np.unique(key):
+        yield np.flatnonzero(key == own)
+
+
+def _levels(geometry: Geometry, full: Corners, small: Corners) -> list[_Level]:
+    """Everything as it is, and the stand-ins after it."""
+    size = geometry.triangle_count
+    levels = []
+    for corners, place, offset in (
+        (full, np.arange(3 * size, dtype=np.int32).reshape(size, 3), 0),
+        (small, _places(geometry, small), size),
+    ):
+        clusters = make_clusters(geometry.corners.reshape(-1, 3)[place], corners.instance)
+        levels.append(_Level(place, clusters, offset))
+    return [level for level in levels if level.clusters.count]
+
+
+def _places(geometry: Geometry, corners: Corners) -> Int32:
+    """(c, 3) a corner of the geometry that lies at each corner's vertex."""
+    out = np.zeros(corners.vertex.shape, np.int32)
+    for instance in np.unique(corners.instance):
+        mesh = geometry.scene.meshes[geometry.scene.instances[instance].mesh]
+        any_corner = np.zeros(len(mesh.vertices), np.int32)
+        any_corner[mesh.triangles.reshape(-1)] = np.arange(mesh.triangles.size)
+        rows = corners.instance == instance
+        out[rows] = any_corner[corners.vertex[rows]] + 3 * geometry.first_triangle[instance]
+    return out
+
+
+def _coarse_corners(geometry: Geometry, coarse: dict[int, CoarseMesh]) -> Corners:
+    """The triangles of all instances' stand-ins."""
+    parts = [
+        Corners(
+            np.full(len(small.source), number, np.int32),
+            small.source + geometry.first_triangle[number],
+            small.triangles,
+        )
+        for number, instance in enumerate(geometry.scene.instances)
+        if (small := coarse.get(instance.mesh)) is not None
+    ]
+    return _joined(*parts)
+
+
+def _joined(*parts: Corners) -> Corners:
+    return Corners(
+        np.concatenate([np.zeros(0, np.int32), *(p.instance for p in parts)]),
+        np.concatenate([np.zeros(0, np.int32), *(p.source for p in parts)]),
+        np.concatenate([np.zeros((0, 3), np.int32), *(p.vertex for p in parts)]),
+    )
+
+
+@contextmanager
+def _clipped(ctx: Any) -> Iterator[None]:
+    """With the four clip distances that keep triangles within their tiles."""
+    planes = [GL_CLIP_DISTANCE0 + k for k in range(4)]
+    for plane in planes:
+        ctx.enable_direct(plane)
+    try:
+        yield
+    finally:
+        for plane in planes:
+            ctx.disable_direct(plane)

@@ -1,0 +1,99 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""What views bring: each pixel's weight times what its entry sends, summed on the GPU (Larsen04 §4, equation 3).
+
+Only the sums are read back, once a target. Two ways: exact sums, which a bake uses, and the mean by the mip-map
+hardware, which is the paper's.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..gpu.context import Gpu
+from ..gpu.programs import draw_program, set_uniforms
+from ..gpu.tables import Table
+from ..scene import Float32
+from .view_raster import Target, pixel_texture
+from .views import View
+
+#: Texture units of the passes "sum" and "weigh".
+UNITS = {"entries": 0, "view": 1, "sent": 2, "triangle": 3}
+
+
+class ViewSums:
+    """Sums over the views of one kind and size; ``entries`` can be seen."""
+
+    def __init__(self, gpu: Gpu, view: View, entries: int) -> None:
+        """Raises GpuFailed where the table of what entries send does not fit the device."""
+        self._gpu, self._view = gpu, view
+        self._sent = Table(gpu, entries)
+        with gpu.current() as ctx:
+            self._pixels = pixel_texture(ctx, view)
+        self._outputs: dict[tuple[int, ...], Any] = {}
+
+    def send(self, sent: Float32) -> None:
+        """From now on entries send ``sent`` (e, 4), see ``Entries.sent``."""
+        self._sent.write(sent)
+
+    def sums(self, target: Target, triangle: Any | None) -> tuple[Float32, Float32]:
+        """((t, 4), (t, 4)) of all tiles of ``target``, for each half of the pixels: the irradiance that they bring,
+        W/m², and the weight of those that count.
+
+        ``triangle``: a texture (across, down) of the normals of the texels' own triangles, tangent space; pixels below
+        them do not count. None: all texels' normals are those of their triangles.
+        """
+        program = draw_program(
+            self._gpu, "sum", VIEW_WIDTH=self._view.width, VIEW_HEIGHT=self._view.height, TILTED=triangle is not None
+        )
+        with self._gpu.current() as ctx:
+            array, first, second, framebuffer = self._output(ctx, program, (target.across, target.down))
+            set_uniforms(program, **UNITS)
+            target.texture.use(UNITS["entries"])
+            self._pixels.use(UNITS["view"])
+            self._sent.texture.use(UNITS["sent"])
+            if triangle is not None:
+                triangle.use(UNITS["triangle"])
+            framebuffer.use()
+            array.render(ctx.TRIANGLES, vertices=3)
+            halves = [np.frombuffer(image.read(), np.float32).reshape(-1, 4) for image in (first, second)]
+        return halves[0], halves[1]
+
+    def mip_map_sums(self, target: Target) -> Float32:
+        """(t, 4) of all tiles as Larsen04 §4 has it: each pixel times its weight and a view's pixels, and the mean by
+        mip-maps. Both halves together. Raises ValueError where a view's width is no power of two."""
+        width, height = self._view.width, self._view.height
+        if width & (width - 1):
+            raise ValueError(f"a view of {width} pixels has no mip-map of one pixel")
+        program = draw_program(self._gpu, "weigh", VIEW_WIDTH=width, VIEW_HEIGHT=height)
+        level = width.bit_length() - 1
+        with self._gpu.current() as ctx:
+            weighed = ctx.texture(target.size, 4, dtype="f4")
+            framebuffer, array = ctx.framebuffer([weighed]), ctx.vertex_array(program, [])
+            set_uniforms(program, **UNITS)
+            target.texture.use(UNITS["entries"])
+            self._pixels.use(UNITS["view"])
+            self._sent.texture.use(UNITS["sent"])
+            framebuffer.use()
+            array.render(ctx.TRIANGLES, vertices=3)
+            weighed.build_mipmaps(0, level)
+            # A view is as many squares high as its pixels have: the mean of each is one pixel of the level.
+            means = np.frombuffer(weighed.read(level=level), np.float32)
+            for thing in (array, framebuffer, weighed):
+                thing.release()
+        squares = means.reshape(target.down, height // width, target.across, 4)
+        return np.asarray(squares.sum(axis=1).reshape(-1, 4), np.float32)
+
+    def release(self) -> None:
+        """Give memory back."""
+        self._sent.release()
+        self._gpu.release(self._pixels, *(t for output in self._outputs.values() for t in output))
+
+    def _output(self, ctx: Any, program: Any, size: tuple[int, int]) -> Any:
+        """What draws ``program``, two images of ``size`` and what draws into them."""
+        key = (program.glo, *size)
+        if key not in self._outputs:
+            images = [ctx.texture(size, 4, dtype="f4") for _ in range(2)]
+            self._outputs[key] = (ctx.vertex_array(program, []), *images, ctx.framebuffer(images))
+        return self._outputs[key]
