@@ -32,13 +32,13 @@ flat in vec3 tangent;
 flat in vec3 normal;
 flat in vec2 tile;
 
-uniform sampler2D view; // direction, tangent space, and weight of each pixel
+uniform sampler2D directions; // of each pixel of a view, tangent space
 
 layout(location = 0) out uint entry;
 
 void main()
 {
-    vec3 way = texelFetch(view, ivec2(gl_FragCoord.xy - tile), 0).xyz;
+    vec3 way = texelFetch(directions, ivec2(gl_FragCoord.xy - tile), 0).xyz;
     entry = sky_entry(way.x * tangent + way.y * cross(normal, tangent) + way.z * normal);
 }
 

@@ -148,7 +148,7 @@ class ViewRaster:
         """Give memory back."""
         self._triangles.release()
         vertex_arrays = (self._drawing, self._clearing)
-        self._gpu.release(*vertex_arrays, self._order, self._eyes, self._pixels, *self._depths.values())
+        self._gpu.release(*vertex_arrays, self._order, self._eyes, self._directions, *self._depths.values())
 
     def _open(self, texels: Texels) -> None:
         """Programs and buffers."""
@@ -168,10 +168,10 @@ class ViewRaster:
             )
             away = [(self._eyes, "12x 3f 3f 2f/i", "in_tangent", "in_normal", "in_tile")]
             self._clearing = ctx.vertex_array(self._clear, away)
-            self._pixels = pixel_texture(ctx, view)
+            self._directions = nearest_texture(ctx, padded(view.directions))
             set_uniforms(self._program, resolution=texels.index.shape[1], none=entries.none)
             set_uniforms(
-                self._clear, size=(view.width, view.height), view=0, sky_size=entries.sky_size,
+                self._clear, size=(view.width, view.height), directions=0, sky_size=entries.sky_size,
                 sky_first=entries.sky_first, escaped=entries.escaped,
             )  # fmt: skip
 
@@ -221,7 +221,7 @@ class ViewRaster:
         self._aim(ctx, target)
         ctx.enable(ctx.DEPTH_TEST)
         ctx.depth_func = "1"  # always: the background takes the place of what was there
-        self._pixels.use(0)
+        self._directions.use(0)
         set_uniforms(self._clear, target=target.size)
         self._clearing.render(ctx.TRIANGLE_STRIP, vertices=4, instances=len(rows))
         ctx.depth_func = "<"
@@ -246,12 +246,16 @@ class ViewRaster:
         target.framebuffer.use()
 
 
-def pixel_texture(ctx: Any, view: View) -> Any:
-    """Direction, tangent space, and weight of each pixel of ``view``."""
-    pixels = np.concatenate([view.directions, view.weights[:, :, None]], axis=2)
-    texture = ctx.texture((view.width, view.height), 4, np.ascontiguousarray(pixels).tobytes(), dtype="f4")
+def nearest_texture(ctx: Any, values: Float32) -> Any:
+    """A texture of ``values`` (h, w, 4), to be fetched pixel by pixel."""
+    texture = ctx.texture(values.shape[1::-1], 4, np.ascontiguousarray(values, np.float32).tobytes(), dtype="f4")
     texture.filter = (ctx.NEAREST, ctx.NEAREST)
     return texture
+
+
+def padded(vectors: Float32) -> Float32:
+    """(..., 4) ``vectors`` (..., 3) and 0."""
+    return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 1), np.float32)], axis=-1)
 
 
 def merged(begin: Int32, end: Int32) -> list[tuple[int, int]]:

@@ -15,11 +15,11 @@ from ..gpu.context import Gpu
 from ..gpu.programs import draw_program, set_uniforms
 from ..gpu.tables import Table
 from ..scene import Float32
-from .view_raster import Target, pixel_texture
+from .view_raster import Target, nearest_texture, padded
 from .views import View
 
 #: Texture units of the passes "sum" and "weigh".
-UNITS = {"entries": 0, "view": 1, "sent": 2, "triangle": 3}
+UNITS = {"entries": 0, "sent": 1, "weights": 2, "directions": 3, "triangle": 4}
 
 
 class ViewSums:
@@ -29,8 +29,17 @@ class ViewSums:
         """Raises GpuFailed where the table of what entries send does not fit the device."""
         self._gpu, self._view = gpu, view
         self._sent = Table(gpu, entries)
+        self._defines = {
+            "VIEW_WIDTH": view.width,
+            "VIEW_HEIGHT": view.height,
+            "WEIGHTS_IN_BLOCK": view.weights.nbytes <= gpu.info.max_uniform_block,
+        }
         with gpu.current() as ctx:
-            self._pixels = pixel_texture(ctx, view)
+            self._directions = nearest_texture(ctx, padded(view.directions))
+            if self._defines["WEIGHTS_IN_BLOCK"]:
+                self._weights: Any = ctx.buffer(view.weights.tobytes())
+            else:
+                self._weights = nearest_texture(ctx, view.weights.reshape(view.height, -1, 4))
         self._outputs: dict[tuple[int, ...], Any] = {}
 
     def send(self, sent: Float32) -> None:
@@ -44,16 +53,12 @@ class ViewSums:
         ``triangle``: a texture (across, down) of the normals of the texels' own triangles, tangent space; pixels below
         them do not count. None: all texels' normals are those of their triangles.
         """
-        program = draw_program(
-            self._gpu, "sum", VIEW_WIDTH=self._view.width, VIEW_HEIGHT=self._view.height, TILTED=triangle is not None
-        )
+        program = draw_program(self._gpu, "sum", outputs=(), TILTED=triangle is not None, **self._defines)
         with self._gpu.current() as ctx:
             array, first, second, framebuffer = self._output(ctx, program, (target.across, target.down))
-            set_uniforms(program, **UNITS)
-            target.texture.use(UNITS["entries"])
-            self._pixels.use(UNITS["view"])
-            self._sent.texture.use(UNITS["sent"])
+            self._bind(program, target)
             if triangle is not None:
+                self._directions.use(UNITS["directions"])
                 triangle.use(UNITS["triangle"])
             framebuffer.use()
             array.render(ctx.TRIANGLES, vertices=3)
@@ -66,15 +71,12 @@ class ViewSums:
         width, height = self._view.width, self._view.height
         if width & (width - 1):
             raise ValueError(f"a view of {width} pixels has no mip-map of one pixel")
-        program = draw_program(self._gpu, "weigh", VIEW_WIDTH=width, VIEW_HEIGHT=height)
+        program = draw_program(self._gpu, "weigh", outputs=(), **self._defines)
         level = width.bit_length() - 1
         with self._gpu.current() as ctx:
             weighed = ctx.texture(target.size, 4, dtype="f4")
             framebuffer, array = ctx.framebuffer([weighed]), ctx.vertex_array(program, [])
-            set_uniforms(program, **UNITS)
-            target.texture.use(UNITS["entries"])
-            self._pixels.use(UNITS["view"])
-            self._sent.texture.use(UNITS["sent"])
+            self._bind(program, target)
             framebuffer.use()
             array.render(ctx.TRIANGLES, vertices=3)
             weighed.build_mipmaps(0, level)
@@ -88,7 +90,19 @@ class ViewSums:
     def release(self) -> None:
         """Give memory back."""
         self._sent.release()
-        self._gpu.release(self._pixels, *(t for output in self._outputs.values() for t in output))
+        self._gpu.release(self._directions, self._weights, *(t for output in self._outputs.values() for t in output))
+
+    def _bind(self, program: Any, target: Target) -> None:
+        """What ``program`` reads."""
+        set_uniforms(program, **{name: unit for name, unit in UNITS.items() if name != "weights"})
+        target.texture.use(UNITS["entries"])
+        self._sent.texture.use(UNITS["sent"])
+        if self._defines["WEIGHTS_IN_BLOCK"]:
+            program["Weights"].binding = 0
+            self._weights.bind_to_uniform_block(0)
+        else:
+            set_uniforms(program, weights=UNITS["weights"])
+            self._weights.use(UNITS["weights"])
 
     def _output(self, ctx: Any, program: Any, size: tuple[int, int]) -> Any:
         """What draws ``program``, two images of ``size`` and what draws into them."""

@@ -17,6 +17,8 @@ from ..surface.texels import Texels
 
 #: A target's number where there is none: black, but seen.
 NOTHING = -1
+#: What an entry sends that is to be passed over; must be below zero, see sum.glsl.
+DOES_NOT_COUNT = (-1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -42,15 +44,15 @@ class Entries:
         return self.count - 1
 
     def sent(self, radiosity: Float32, seen_as: Int32 | None) -> Float32:
-        """(e, 4) radiosity, W/m², of all entries, and 1 where it counts, else 0.
+        """(e, 4) radiosity, W/m², of all entries; red below zero where it does not count. Blue is followed by nothing.
 
         radiosity (m, 3) of all targets · seen_as (m,): the target that each is seen as, NOTHING: it does not count.
         """
         target = self.target if seen_as is None else np.append(seen_as, np.int32(NOTHING))[self.target]
         out = np.zeros((self.count, 4), np.float32)
-        out[:, :3] = np.append(radiosity, np.zeros((1, 3), np.float32), axis=0)[target]
-        out[:, 3] = target >= 0
-        out[self.escaped, 3] = 1
+        out[:, :3] = radiosity.take(target, axis=0, mode="clip") if len(radiosity) else 0
+        out[target < 0, :3] = DOES_NOT_COUNT
+        out[self.escaped] = 0
         return out
 
 

@@ -58,10 +58,10 @@ def make_view(kind: Gather, size: int, enlargement: float = 2.0) -> View:
     """The view of ``size`` pixels along a side.
 
     PLANE: its half side is ``enlargement`` times its distance. HEMICUBE: the top, and below it in the picture the upper
-    halves of the four sides. Raises ValueError for another kind, and for a size that is not even.
+    halves of the four sides. Raises ValueError for another kind, and for a size that is no multiple of four.
     """
-    if size < 2 or size % 2:
-        raise ValueError(f"{size} pixels along a view: must be even")
+    if size < 4 or size % 4:
+        raise ValueError(f"{size} pixels along a view: must be a multiple of four")
     if kind is Gather.PLANE:
         faces: tuple[Face, ...] = (Face(_plane_axes(enlargement), -1.0, (0, 0, size, size)),)
         parts = [front_weights(size, enlargement)]

@@ -40,6 +40,7 @@ class GpuInfo:
     software: bool  # draws on the CPU
     max_texture: int  # longest side of a texture, pixels
     max_layers: int  # of an array texture
+    max_uniform_block: int  # bytes
     max_storage: int  # bytes of one storage buffer, 0 without compute
 
     @property
@@ -132,6 +133,7 @@ def _info(ctx: Any) -> GpuInfo:
         software=any(name in renderer.lower() for name in SOFTWARE_NAMES),
         max_texture=int(info["GL_MAX_TEXTURE_SIZE"]),
         max_layers=int(info["GL_MAX_ARRAY_TEXTURE_LAYERS"]),
+        max_uniform_block=int(info["GL_MAX_UNIFORM_BLOCK_SIZE"]),
         max_storage=int(info.get("GL_MAX_SHADER_STORAGE_BLOCK_SIZE", 0)) if ctx.version_code >= COMPUTE_VERSION else 0,
     )
 
