@@ -7,11 +7,21 @@
 // There is no near plane: depth is written by the fragment, as the logarithm of the distance, and nothing is clipped
 // along the way. What touches the texel is drawn as well as what is a kilometre away.
 
+#ifndef TWO_SIDED
+#error Required define TWO_SIDED, 0 or 1: has any back side a map?
+#endif
+#if TWO_SIDED
+#define PIXEL vec4 // column and row on the atlas page: of the front side, of the back side
+#define FIRST ivec2
+#else
+#define PIXEL vec2
+#define FIRST int
+#endif
 #if defined VERTEX_SHADER
 
 in vec3 in_position; // local space
-in vec4 in_pixel;    // column and row on the atlas page of this corner: of the front side, of the back side
-in ivec2 in_first;   // number of the page's first pixel for each side; -1: that side has no map
+in PIXEL in_pixel;
+in FIRST in_first; // number of the page's first pixel for each side; -1: that side has no map
 
 // of the texel
 in vec3 in_eye;
@@ -24,8 +34,8 @@ uniform float low;      // lowest y that is drawn, in units of forward
 uniform vec4 rectangle; // left, bottom, width, height of the face within a view, pixels
 uniform vec2 target;    // width and height of the target, pixels
 
-out vec4 pixel;
-flat out ivec2 first;
+out PIXEL pixel;
+flat out FIRST first;
 out float gl_ClipDistance[4];
 
 void main()
@@ -46,23 +56,27 @@ void main()
 
 #elif defined FRAGMENT_SHADER
 
-in vec4 pixel;
-flat in ivec2 first;
+in PIXEL pixel;
+flat in FIRST first;
 
 uniform int resolution;    // of an atlas page
 uniform uint none;         // the entry of what has no light
-uniform float near;        // distances far below it are not told apart, m
-uniform float depth_scale; // 1 / log2(1 + far / near)
+uniform vec2 depth;        // of 1 m, and what each octave of distance adds
 
 layout(location = 0) out uint entry;
 
 void main()
 {
+#if TWO_SIDED
     vec2 at = gl_FrontFacing ? pixel.xy : pixel.zw;
     int page = gl_FrontFacing ? first.x : first.y;
+#else
+    vec2 at = pixel;
+    int page = gl_FrontFacing ? first : -1;
+#endif
     ivec2 cell = clamp(ivec2(at), 0, resolution - 1);
     entry = page < 0 ? none : uint(page + cell.y * resolution + cell.x);
-    gl_FragDepth = log2(1.0 + 1.0 / (gl_FragCoord.w * near)) * depth_scale;
+    gl_FragDepth = depth.x - depth.y * log2(gl_FragCoord.w);
 }
 
 #endif

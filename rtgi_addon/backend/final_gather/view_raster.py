@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..gpu.context import Gpu
 from ..gpu.pace import Pace
 from ..gpu.programs import draw_program, set_uniforms
-from ..gpu.triangles import Corners, SceneTriangles, corners_of_scene, farthest
+from ..gpu.triangles import CORNER_FORMAT, Corners, SceneTriangles, corners_of_scene, farthest
 from ..scene import Bool, Float32, FrameState, Int32
 from ..surface.geometry import Geometry
 from ..surface.texels import Texels
@@ -101,6 +101,7 @@ class _Scenery:
     instance: Int32  # (k,)
     coarse: Bool  # (k,) of a stand-in
     shown: Bool  # (k,)
+    depth: tuple[float, float]  # see view.glsl
     begin: Int32  # (k,) first triangle in the buffer of all
     end: Int32  # (k,)
 
@@ -120,7 +121,8 @@ class ViewRaster:
         self._levels = _levels(geometry, full, small)
         self._pace = Pace(LEAST_VIEWS, MOST_VIEWS, FIRST_VIEWS)
         self._depths: dict[tuple[int, int], Any] = {}
-        self._open(texels)
+        self._resolution = texels.index.shape[1]
+        self._open()
         self._mirrored = geometry.mirrored.copy()
         self._write_indices()
         self._scenery = self._look(state)
@@ -135,12 +137,18 @@ class ViewRaster:
 
     def draw(self, target: Target, tile: Int32, eyes: Eyes) -> None:
         """Draw the views of ``eyes`` (k,) into the tiles (k,) of ``target``; all its others stay as they are."""
+        cleared = len(tile) == target.tiles and self._entries.plain_sky
+        if cleared:
+            with self._gpu.current() as ctx:
+                self._aim(ctx, target)
+                self._eyes.write(bytes(EYE.itemsize))  # one tile: all of the target
+                self._erase(ctx, target, 1, target.size)
         for rows in _alike(self._has_coarse, eyes.instance):
             done = 0
             while done < len(rows):
                 part = rows[done : done + self._pace.items]
                 with self._pace.timed(len(part)), self._gpu.current() as ctx:
-                    self._draw(ctx, target, target.corners(tile[part]), eyes.take(part))
+                    self._draw(ctx, target, target.corners(tile[part]), eyes.take(part), cleared=cleared)
                     ctx.finish()
                 done += len(part)
 
@@ -150,10 +158,13 @@ class ViewRaster:
         vertex_arrays = (self._drawing, self._clearing)
         self._gpu.release(*vertex_arrays, self._order, self._eyes, self._directions, *self._depths.values())
 
-    def _open(self, texels: Texels) -> None:
+    def _open(self) -> None:
         """Programs and buffers."""
         view, entries = self._view, self._entries
-        self._program, self._clear = draw_program(self._gpu, "view"), draw_program(self._gpu, "background")
+        self._program, self._clear = (
+            draw_program(self._gpu, "view", TWO_SIDED=self._triangles.two_sided),
+            draw_program(self._gpu, "background"),
+        )
         with self._gpu.current() as ctx:
             self._order = ctx.buffer(reserve=12 * max(self._triangles.count, 1))
             self._eyes = ctx.buffer(reserve=MOST_VIEWS * EYE.itemsize)
@@ -161,19 +172,14 @@ class ViewRaster:
                 self._program,
                 [
                     (self._triangles.placed, "3f", "in_position"),
-                    (self._triangles.corner_rows, "4f 2i", "in_pixel", "in_first"),
+                    (self._triangles.corner_rows, *CORNER_FORMAT[self._triangles.two_sided]),
                     (self._eyes, "3f 3f 3f 2f/i", "in_eye", "in_tangent", "in_normal", "in_tile"),
                 ],
                 index_buffer=self._order,
             )
             away = [(self._eyes, "12x 3f 3f 2f/i", "in_tangent", "in_normal", "in_tile")]
             self._clearing = ctx.vertex_array(self._clear, away)
-            self._directions = nearest_texture(ctx, padded(view.directions))
-            set_uniforms(self._program, resolution=texels.index.shape[1], none=entries.none)
-            set_uniforms(
-                self._clear, size=(view.width, view.height), directions=0, sky_size=entries.sky_size,
-                sky_first=entries.sky_first, escaped=entries.escaped,
-            )  # fmt: skip
+            self._directions = nearest_texture(ctx, padded(self._view.directions))
 
     def _write_indices(self) -> None:
         with self._gpu.current():
@@ -184,12 +190,8 @@ class ViewRaster:
 
     def _look(self, state: FrameState) -> _Scenery:
         """What is there to draw, and where."""
-        with self._gpu.current():
-            near = farthest(self._geometry) * NEAR_SHARE
-            set_uniforms(
-                self._program,
-                near=max(near, float(np.finfo(np.float32).tiny)), depth_scale=float(1 / np.log2(1 + 1 / NEAR_SHARE)),
-            )  # fmt: skip
+        octaves = float(np.log2(1 / NEAR_SHARE))
+        near = max(farthest(self._geometry) * NEAR_SHARE, float(np.finfo(np.float32).tiny))
         shown = state.visible & np.array([i.blocks_light for i in self._geometry.scene.instances], np.bool_)
         known = self._geometry.corners.reshape(-1, 3)
         spheres = [cluster_spheres(known[level.place], level.clusters) for level in self._levels]
@@ -200,6 +202,7 @@ class ViewRaster:
             instance=instance,
             coarse=np.concatenate([np.full(level.clusters.count, level.offset > 0) for level in self._levels]),
             shown=shown[instance],
+            depth=(-float(np.log2(near)) / octaves, 1 / octaves),
             begin=np.concatenate([level.clusters.first[:-1] + level.offset for level in self._levels]),
             end=np.concatenate([level.clusters.first[1:] + level.offset for level in self._levels]),
         )
@@ -213,29 +216,42 @@ class ViewRaster:
         rows = rows[in_front(scenery.centre[rows], scenery.radius[rows], eyes.eye, eyes.normal)]
         return merged(scenery.begin[rows], scenery.end[rows])
 
-    def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes) -> None:
+    def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes, *, cleared: bool) -> None:
         rows = np.zeros(len(corner), EYE)
         rows["eye"], rows["tangent"], rows["normal"], rows["tile"] = eyes.eye, eyes.tangent, eyes.normal, corner
         self._eyes.orphan()
         self._eyes.write(rows.tobytes())
         self._aim(ctx, target)
         ctx.enable(ctx.DEPTH_TEST)
-        ctx.depth_func = "1"  # always: the background takes the place of what was there
-        self._directions.use(0)
-        set_uniforms(self._clear, target=target.size)
-        self._clearing.render(ctx.TRIANGLE_STRIP, vertices=4, instances=len(rows))
+        if not cleared:
+            self._erase(ctx, target, len(rows), (self._view.width, self._view.height))
         ctx.depth_func = "<"
         ctx.front_face = "cw"  # the picture looks along the normal with the tangent to the right: a mirror image
         ranges = self._ranges(eyes)
+        # Programs are shared by all views of the context: what one sets does not stay.
+        set_uniforms(
+            self._program, resolution=self._resolution, none=self._entries.none, target=target.size,
+            depth=self._scenery.depth,
+        )  # fmt: skip
         with _clipped(ctx):
             for face in self._view.faces:
-                set_uniforms(
-                    self._program, axes=tuple(face.axes.T.reshape(-1)), low=face.low, rectangle=face.rectangle,
-                    target=target.size,
-                )  # fmt: skip
+                axes = tuple(face.axes.T.reshape(-1))
+                set_uniforms(self._program, axes=axes, low=face.low, rectangle=face.rectangle)
                 for first, count in ranges:
                     self._drawing.render(ctx.TRIANGLES, vertices=3 * count, first=3 * first, instances=len(rows))
         ctx.disable(ctx.DEPTH_TEST)
+
+    def _erase(self, ctx: Any, target: Target, tiles: int, size: tuple[int, int]) -> None:
+        """Put the sky, infinitely far, into the first ``tiles`` of the eyes' tiles, each of ``size`` pixels."""
+        ctx.enable(ctx.DEPTH_TEST)
+        ctx.depth_func = "1"  # always: it takes the place of what was there
+        self._directions.use(0)
+        entries = self._entries
+        set_uniforms(
+            self._clear, size=size, target=target.size, directions=0, sky_size=entries.sky_size,
+            sky_first=entries.sky_first, escaped=entries.escaped,
+        )  # fmt: skip
+        self._clearing.render(ctx.TRIANGLE_STRIP, vertices=4, instances=tiles)
 
     def _aim(self, ctx: Any, target: Target) -> None:
         """Draw to ``target`` from now on; targets of one size share their depths."""

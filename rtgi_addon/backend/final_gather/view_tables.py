@@ -39,6 +39,11 @@ class Entries:
         return self.count - 2
 
     @property
+    def plain_sky(self) -> bool:
+        """Does every pixel that shows no surface show the same, whichever way it looks?"""
+        return self.sky_size[0] * self.sky_size[1] < 2
+
+    @property
     def none(self) -> int:
         """A side without a map: what sees it is under other geometry, and the rest of the view makes up for it."""
         return self.count - 1

@@ -21,6 +21,11 @@ from .programs import draw_program, set_uniforms
 
 #: What a corner is told apart by, beside its vertex: pixels on both sides and the pages' first pixels.
 CORNER = np.dtype([("pixel", np.float32, 4), ("first", np.int32, 2)])
+#: How the pass "view" reads it, without backs and with.
+CORNER_FORMAT = {
+    False: ("2f 8x 1i 4x", "in_pixel", "in_first"),
+    True: ("4f 2i", "in_pixel", "in_first"),
+}
 #: A side without a map.
 NO_PAGE = -1
 
@@ -57,6 +62,8 @@ class SceneTriangles:
         self._vertex = corners.vertex.reshape(-1)[kept]
         self._triangle_instance = corners.instance
         self._first = np.searchsorted(self._instance, np.arange(len(geometry.scene.instances) + 1))
+        #: Does any back have a map? If none does, backs are not told apart.
+        self.two_sided = bool((rows["first"][:, :, 1] != NO_PAGE).any())
         self._middle: dict[int, Float64] = {}
         self.count = len(corners.instance)
         with gpu.current() as ctx:
