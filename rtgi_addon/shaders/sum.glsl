@@ -22,7 +22,7 @@
 #include "inc/weights.glsl"
 
 uniform usampler2D entries;   // what each pixel sees
-uniform sampler2D sent;       // radiosity of each entry, W/m²; red below zero where it does not count
+uniform sampler2D sent;       // radiosity of each entry, W/m²; red below LEAST_SENT where it does not count
 uniform sampler2D directions; // of each pixel of a view, tangent space
 uniform sampler2D triangle;   // of each view: the normal of the texel's own triangle, tangent space
 
@@ -44,14 +44,14 @@ void main()
             vec4 weight = weights_at(x, y);
             for (int k = 0; k < 4; ++k) {
                 vec3 brought = table_entry(sent, texelFetch(entries, corner + ivec2(x + k, y), 0).x).rgb;
-                float counts = brought.r < 0.0 ? 0.0 : weight[k];
+                vec4 counted = brought.r < LEAST_SENT ? vec4(0.0) : weight[k] * vec4(brought, 1.0);
 #if TILTED
-                counts = dot(texelFetch(directions, ivec2(x + k, y), 0).xyz, up) > 0.0 ? counts : 0.0;
+                counted = dot(texelFetch(directions, ivec2(x + k, y), 0).xyz, up) > 0.0 ? counted : vec4(0.0);
 #endif
                 if ((k & 1) == 0)
-                    even += counts * vec4(brought, 1.0);
+                    even += counted;
                 else
-                    odd += counts * vec4(brought, 1.0);
+                    odd += counted;
             }
         }
         total[0] += (y & 1) == 0 ? even : odd;

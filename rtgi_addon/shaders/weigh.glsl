@@ -18,7 +18,7 @@
 #include "inc/weights.glsl"
 
 uniform usampler2D entries; // what each pixel sees
-uniform sampler2D sent;     // radiosity of each entry, W/m²; red below zero where it does not count
+uniform sampler2D sent;     // radiosity of each entry, W/m²; red below LEAST_SENT where it does not count
 
 layout(location = 0) out vec4 weighed;
 
@@ -27,8 +27,8 @@ void main()
     ivec2 at = ivec2(gl_FragCoord.xy);
     ivec2 within = at % ivec2(VIEW_WIDTH, VIEW_HEIGHT);
     vec3 brought = table_entry(sent, texelFetch(entries, at, 0).x).rgb;
-    float weight = brought.r < 0.0 ? 0.0 : weights_at(within.x & ~3, within.y)[within.x & 3];
-    weighed = vec4(brought, 1.0) * (weight * float(VIEW_WIDTH * VIEW_WIDTH));
+    float weight = weights_at(within.x & ~3, within.y)[within.x & 3] * float(VIEW_WIDTH * VIEW_WIDTH);
+    weighed = brought.r < LEAST_SENT ? vec4(0.0) : vec4(brought, 1.0) * weight;
 }
 
 #endif

@@ -160,7 +160,6 @@ class ViewRaster:
 
     def _open(self) -> None:
         """Programs and buffers."""
-        view, entries = self._view, self._entries
         self._program, self._clear = (
             draw_program(self._gpu, "view", TWO_SIDED=self._triangles.two_sided),
             draw_program(self._gpu, "background"),

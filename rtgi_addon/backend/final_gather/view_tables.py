@@ -17,8 +17,9 @@ from ..surface.texels import Texels
 
 #: A target's number where there is none: black, but seen.
 NOTHING = -1
-#: What an entry sends that is to be passed over; must be below zero, see sum.glsl.
-DOES_NOT_COUNT = (-1.0, 0.0, 0.0)
+#: What an entry sends that is to be passed over: farther below zero than any light is above, and than the vectors that
+#: solvers put in its place. Must be below LEAST_SENT of inc/table.glsl.
+DOES_NOT_COUNT = (-2e38, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -49,7 +50,7 @@ class Entries:
         return self.count - 1
 
     def sent(self, radiosity: Float32, seen_as: Int32 | None) -> Float32:
-        """(e, 4) radiosity, W/m², of all entries; red below zero where it does not count. Blue is followed by nothing.
+        """(e, 4) radiosity, W/m², of all entries; DOES_NOT_COUNT where it does not. The fourth number means nothing.
 
         radiosity (m, 3) of all targets · seen_as (m,): the target that each is seen as, NOTHING: it does not count.
         """

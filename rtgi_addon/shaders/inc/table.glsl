@@ -6,3 +6,6 @@ vec4 table_entry(sampler2D table, uint index)
 {
     return texelFetch(table, ivec2(index % TABLE_WIDTH, index / TABLE_WIDTH), 0);
 }
+
+// Entries with less red do not count; see DOES_NOT_COUNT in backend/final_gather/view_tables.py.
+const float LEAST_SENT = -1e38;
