@@ -45,7 +45,8 @@ class Gathers:
 
     def make_tracer(self, scene: Scene, geometry: Geometry, state: FrameState) -> FollowingTracer:
         """What traces rays, in the frame that ``geometry`` and ``state`` stand in."""
-        if self._gpu is None or self._settings.device is not Device.GPU or not self._gpu.info.computes:
+        asked = self._settings.device is Device.GPU or self._settings.gather is Gather.RAYS
+        if self._gpu is None or not asked or not self._gpu.info.computes:
             return EmbreeTracer(scene, geometry, state, self._workers)
         return ComputeTracer(scene, geometry, state, self._gpu)
 

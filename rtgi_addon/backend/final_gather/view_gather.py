@@ -8,18 +8,19 @@ moving lamps nothing is drawn. What does not fit the memory allowed is drawn ane
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.context import Gpu
+from ..gpu.compute_tracer import ComputeTracer
+from ..gpu.context import Gpu, GpuFailed
 from ..parallel import CHUNK_RAYS, Workers
 from ..placed import PlacedScene
 from ..sampling import dot, frames, hash_keys, unit_float32
-from ..scene import Bool, Float32, Int32
+from ..scene import Bool, Float32, FrameState, Int32
 from ..selection.changes import Change
-from ..settings import SampleCounts
+from ..settings import Gather, SampleCounts
 from ..surface.rasterise import POINTS
 from ..surface.texels import stand_ins
 from .bright import BrightTargets
@@ -30,6 +31,7 @@ from .links import MOST_HALF_SCALE
 from .openness import open_texels
 from .patterns import TILE, pattern_of_texels
 from .view_raster import Eyes, Target, ViewRaster
+from .view_rays import ViewRays
 from .view_sums import ViewSums
 from .view_tables import NOTHING, make_entries
 from .views import LEAST_SIZE, MOST_SIZE, View
@@ -46,6 +48,22 @@ def view_size(samples: SampleCounts) -> int:
     """Pixels along a view that stand for ``samples`` rays: 16, 32, 64 for draft, preview, final."""
     size = 1 << int(np.ceil(np.log2(4 * np.sqrt(samples.total)) - 1e-9))
     return min(max(size, LEAST_SIZE), MOST_SIZE)
+
+
+class ViewSource(Protocol):
+    """What fills the tiles of targets."""
+
+    def follow(self, moved: NDArray[np.int64], state: FrameState) -> None:
+        """Bring the instances ``moved`` to where they are now, and show what ``state`` does."""
+        ...
+
+    def draw(self, target: Target, tile: Int32, eyes: Eyes) -> None:
+        """Fill the tiles (k,) of ``target`` with the views of ``eyes`` (k,)."""
+        ...
+
+    def release(self) -> None:
+        """Give memory back."""
+        ...
 
 
 class ViewGather:
@@ -65,10 +83,18 @@ class ViewGather:
             texels, placed.frame, placed.geometry, placed.surfaces, placed.tracer, placed.sky, nothing_bright(placed),
             PROBES, max_specular=0, seed=seed,
         )  # fmt: skip
-        self._turn = _turns(pattern_of_texels(texels.page, texels.row, texels.col, seed), seed)
+        self._shift = _shifts(pattern_of_texels(texels.page, texels.row, texels.col, seed), seed)
         self._entries = make_entries(texels, placed.sky)
-        self._source = ViewRaster(gpu, view, placed.geometry, texels, placed.state, self._entries, coarse)
-        self._sums = ViewSums(gpu, view, self._entries.count)
+        self._source: ViewSource
+        if view.kind is Gather.RAYS:
+            if not isinstance(placed.tracer, ComputeTracer):
+                raise GpuFailed("gather rays: the scene is not traced by the GPU")
+            self._source = ViewRays(gpu, view, placed.geometry, texels, placed.tracer, self._entries)
+        else:
+            self._source = ViewRaster(gpu, view, placed.geometry, texels, placed.state, self._entries, coarse)
+        # A device that has compute shaders sums faster by them; software does not.
+        by_groups = gpu.info.computes and not gpu.info.software
+        self._sums = ViewSums(gpu, view, self._entries.count, by_groups=by_groups)
         self._open = _Opened(texels.count)
         self._pending = np.ones(texels.count, np.bool_)
         self._targets = self._make_targets(memory)
@@ -179,7 +205,10 @@ class ViewGather:
 
     def _make_targets(self, memory: int) -> list[_ViewTarget]:
         """As many as the texels need and ``memory`` holds."""
-        self._tilted = bool(np.any(np.abs(self._placed.frame.normal - self._placed.frame.geometric_normal) > FLAT))
+        # Rays below a texel's own triangle are left out as they are traced.
+        self._tilted = self._view.kind is not Gather.RAYS and bool(
+            np.any(np.abs(self._placed.frame.normal - self._placed.frame.geometric_normal) > FLAT)
+        )
         shape = self._fitting(self.count)
         each = 4 * shape.tiles * self._view.width * self._view.height
         number = min(-(-self.count // shape.tiles), memory // each)
@@ -211,17 +240,21 @@ class ViewGather:
         eye = np.where(flat[:, None], middle, points[np.arange(len(texel)), nearest])
         normal = frame.normal[texel]
         tangent, bitangent = frames(normal)
-        cosine, sine = (f(self._turn[texel])[:, None].astype(np.float32) for f in (np.cos, np.sin))
-        return Eyes(eye, tangent * cosine + bitangent * sine, normal, texels.instance[texel])
+        # A quarter turn brings a view's pixels back to where they were.
+        turn = self._shift[texel, :1] * np.float32(np.pi / 2)
+        cosine, sine = np.cos(turn), np.sin(turn)
+        return Eyes(
+            eye, tangent * cosine + bitangent * sine, normal, frame.geometric_normal[texel], texels.instance[texel],
+            points, opened, self._shift[texel],
+        )  # fmt: skip
 
     def _tilt(self, texel: Int32) -> Float32 | None:
         """(m, 4) normals of the own triangles of ``texel`` (m,), tangent space; None where no texel's is tilted."""
         if not self._tilted:
             return None
-        frame, eyes = self._placed.frame, self._eyes(texel)
-        own = frame.geometric_normal[texel]
-        across = np.cross(eyes.normal, eyes.tangent)
-        parts = [dot(own, eyes.tangent), dot(own, across.astype(np.float32)), dot(own, eyes.normal)]
+        eyes = self._eyes(texel)
+        across = np.cross(eyes.normal, eyes.tangent).astype(np.float32)
+        parts = [dot(eyes.own, axis) for axis in (eyes.tangent, across, eyes.normal)]
         return np.asarray(np.stack([*parts, np.zeros(len(texel), np.float32)], axis=1), np.float32)
 
 
@@ -272,7 +305,7 @@ class _ViewTarget:
                 self.triangle = ctx.texture((shape.across, shape.down), 4, dtype="f4")
                 self.triangle.filter = (ctx.NEAREST, ctx.NEAREST)
 
-    def draw(self, source: ViewRaster, tile: Int32, eyes: Eyes, tilt: Float32 | None) -> None:
+    def draw(self, source: ViewSource, tile: Int32, eyes: Eyes, tilt: Float32 | None) -> None:
         if not len(tile):
             return
         source.draw(self.target, tile, eyes)
@@ -301,13 +334,13 @@ def nothing_bright(placed: PlacedScene) -> BrightTargets:
     return BrightTargets(np.zeros(placed.texels.count, np.int32), none.astype(np.float32), np.zeros((1, count + 1)))
 
 
-def _turns(pattern: Int32, seed: int) -> Float32:
-    """(n,) rad: how far each texel's view is turned about its normal. A quarter brings a view's pixels back to where
-    they were; the texels of a tile divide one evenly, so that what the denoiser averages cancels."""
+def _shifts(pattern: Int32, seed: int) -> Float32:
+    """(n, 2) in [0, 1), evenly spread over the texels of a tile, so that what the denoiser averages cancels."""
     sets, within = np.divmod(pattern, TILE * TILE)
     bits = np.array([int(f"{k:04b}"[::-1], 2) for k in range(TILE * TILE)])
-    share = bits[within] / (TILE * TILE) + unit_float32(hash_keys(sets, 5, seed))
-    return np.asarray(share % 1.0 * (np.pi / 2), np.float32)
+    share = np.stack([bits[within], within], axis=1) / (TILE * TILE)
+    turned = np.stack([unit_float32(hash_keys(sets, k, seed)) for k in (5, 6)], axis=1)
+    return np.asarray((share + turned) % 1.0, np.float32)
 
 
 def _inverse(weight: Float32) -> Float32:

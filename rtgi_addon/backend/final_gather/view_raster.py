@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -46,10 +46,14 @@ class Eyes:
     eye: Float32  # (m, 3)
     tangent: Float32  # (m, 3) unit
     normal: Float32  # (m, 3) unit
+    own: Float32  # (m, 3) unit, of the texel's own triangle
     instance: Int32  # (m,) on which the texel lies
+    points: Float32  # (m, POINTS, 3) of the texel
+    opened: Bool  # (m, POINTS) which of them lie in the open
+    shift: Float32  # (m, 2) in [0, 1): what tells its rays from those of its neighbours
 
     def take(self, rows: NDArray[np.integer[Any]]) -> Eyes:
-        return Eyes(self.eye[rows], self.tangent[rows], self.normal[rows], self.instance[rows])
+        return Eyes(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 class Target:

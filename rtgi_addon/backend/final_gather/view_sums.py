@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..gpu.context import Gpu
-from ..gpu.programs import draw_program, set_uniforms
+from ..gpu.programs import compute_program, draw_program, set_uniforms
 from ..gpu.tables import Table
 from ..scene import Float32
 from .view_raster import Target, nearest_texture, padded
@@ -25,9 +25,11 @@ UNITS = {"entries": 0, "sent": 1, "weights": 2, "directions": 3, "triangle": 4}
 class ViewSums:
     """Sums over the views of one kind and size; ``entries`` can be seen."""
 
-    def __init__(self, gpu: Gpu, view: View, entries: int) -> None:
-        """Raises GpuFailed where the table of what entries send does not fit the device."""
-        self._gpu, self._view = gpu, view
+    def __init__(self, gpu: Gpu, view: View, entries: int, *, by_groups: bool = False) -> None:
+        """``by_groups``: by compute shaders instead of drawing; the same sums but for rounding.
+
+        Raises GpuFailed where the table of what entries send does not fit the device."""
+        self._gpu, self._view, self._by_groups = gpu, view, by_groups
         self._sent = Table(gpu, entries)
         self._defines = {
             "VIEW_WIDTH": view.width,
@@ -40,6 +42,7 @@ class ViewSums:
                 self._weights: Any = ctx.buffer(view.weights.tobytes())
             else:
                 self._weights = nearest_texture(ctx, view.weights.reshape(view.height, -1, 4))
+        self._group_output: Any = None
         self._outputs: dict[tuple[int, ...], Any] = {}
 
     def send(self, sent: Float32) -> None:
@@ -53,13 +56,12 @@ class ViewSums:
         ``triangle``: a texture (across, down) of the normals of the texels' own triangles, tangent space; pixels below
         them do not count. None: all texels' normals are those of their triangles.
         """
+        if self._by_groups:
+            return self._group_sums(target, triangle)
         program = draw_program(self._gpu, "sum", outputs=(), TILTED=triangle is not None, **self._defines)
         with self._gpu.current() as ctx:
             array, first, second, framebuffer = self._output(ctx, program, (target.across, target.down))
-            self._bind(program, target)
-            if triangle is not None:
-                self._directions.use(UNITS["directions"])
-                triangle.use(UNITS["triangle"])
+            self._bind(program, target, triangle)
             framebuffer.use()
             array.render(ctx.TRIANGLES, vertices=3)
             halves = [np.frombuffer(image.read(), np.float32).reshape(-1, 4) for image in (first, second)]
@@ -76,7 +78,7 @@ class ViewSums:
         with self._gpu.current() as ctx:
             weighed = ctx.texture(target.size, 4, dtype="f4")
             framebuffer, array = ctx.framebuffer([weighed]), ctx.vertex_array(program, [])
-            self._bind(program, target)
+            self._bind(program, target, None)
             framebuffer.use()
             array.render(ctx.TRIANGLES, vertices=3)
             weighed.build_mipmaps(0, level)
@@ -90,12 +92,34 @@ class ViewSums:
     def release(self) -> None:
         """Give memory back."""
         self._sent.release()
-        self._gpu.release(self._directions, self._weights, *(t for output in self._outputs.values() for t in output))
+        self._gpu.release(
+            self._directions,
+            self._weights,
+            self._group_output,
+            *(t for output in self._outputs.values() for t in output),
+        )
 
-    def _bind(self, program: Any, target: Target) -> None:
+    def _group_sums(self, target: Target, triangle: Any | None) -> tuple[Float32, Float32]:
+        program = compute_program(self._gpu, "sum_groups", TILTED=triangle is not None, SUMS=0, **self._defines)
+        with self._gpu.current() as ctx:
+            if self._group_output is None or self._group_output.size != 32 * target.tiles:
+                self._gpu.release(self._group_output)
+                self._group_output = ctx.buffer(reserve=32 * target.tiles)
+            self._bind(program, target, triangle)
+            set_uniforms(program, across=target.across)
+            self._group_output.bind_to_storage_buffer(0)
+            program.run(group_x=target.tiles)
+            ctx.memory_barrier()
+            halves = np.frombuffer(self._group_output.read(), np.float32).reshape(-1, 2, 4)
+        return halves[:, 0], halves[:, 1]
+
+    def _bind(self, program: Any, target: Target, triangle: Any | None) -> None:
         """What ``program`` reads."""
         set_uniforms(program, **{name: unit for name, unit in UNITS.items() if name != "weights"})
         target.texture.use(UNITS["entries"])
+        if triangle is not None:
+            self._directions.use(UNITS["directions"])
+            triangle.use(UNITS["triangle"])
         self._sent.texture.use(UNITS["sent"])
         if self._defines["WEIGHTS_IN_BLOCK"]:
             program["Weights"].binding = 0

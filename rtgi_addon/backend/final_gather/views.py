@@ -40,7 +40,7 @@ class View:
     """H × W pixels, those of all faces; row 0 is the bottom row."""
 
     kind: Gather
-    faces: tuple[Face, ...]
+    faces: tuple[Face, ...]  # none for rays
     directions: Float32  # (H, W, 3) unit, tangent space: through the middle of each pixel
     weights: Float32  # (H, W) share of the cosine-weighted hemisphere
     second: Bool  # (H, W) which pixels are of the second half; each half is a view by itself
@@ -57,8 +57,10 @@ class View:
 def make_view(kind: Gather, size: int, enlargement: float = 2.0) -> View:
     """The view of ``size`` pixels along a side.
 
-    PLANE: its half side is ``enlargement`` times its distance. HEMICUBE: the top, and below it in the picture the upper
-    halves of the four sides. Raises ValueError for another kind, and for a size that is no multiple of four.
+    PLANE: its half side is ``enlargement`` times its distance. HEMICUBE: the top, and above it in the picture the upper
+    halves of the four sides. RAYS: size² rays, whose directions are not its pixels'.
+
+    Raises ValueError for another kind, and for a size that is no multiple of four.
     """
     if size < 4 or size % 4:
         raise ValueError(f"{size} pixels along a view: must be a multiple of four")
@@ -70,12 +72,21 @@ def make_view(kind: Gather, size: int, enlargement: float = 2.0) -> View:
         sides = [Face(axes, 0.0, (0, size + k * half, size, half)) for k, axes in enumerate(_side_axes())]
         faces = (Face(_plane_axes(1.0), -1.0, (0, 0, size, size)), *sides)
         parts = [front_weights(size, 1.0), *[side_weights(size)] * 4]
+    elif kind is Gather.RAYS:
+        return _rays_view(size)
     else:
-        raise ValueError(f"{kind}: not a view that is drawn")
+        raise ValueError(f"{kind}: not a view")
     weights = np.concatenate(parts, axis=0)
     row, col = np.indices(weights.shape)
     directions = np.concatenate([_directions(face) for face in faces], axis=0)
     return View(kind, faces, directions.astype(np.float32), weights.astype(np.float32), (row + col) % 2 == 1)
+
+
+def _rays_view(size: int) -> View:
+    """Pixels that are rays by the cosine: all weigh alike. Which is which hangs on the texel, see rays.glsl."""
+    weights = np.full((size, size), 1 / size**2, np.float32)
+    row, col = np.indices(weights.shape)
+    return View(Gather.RAYS, (), np.zeros((size, size, 3), np.float32), weights, (row + col) % 2 == 1)
 
 
 def coverage(kind: Gather, enlargement: float = 2.0) -> float:
