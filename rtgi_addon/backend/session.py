@@ -16,11 +16,11 @@ import numpy as np
 
 from .final_gather import radiosity
 from .final_gather.bright import BrightTargets, bright_targets, bright_weight
+from .final_gather.choice import ChoiceFile
 from .final_gather.components import SurfaceGraph
 from .final_gather.gathers import Gathers
 from .final_gather.lighting import Light, Lighting
 from .final_gather.rooms import look_around, rooms_of
-from .final_gather.view_gather import view_size
 from .finish.finisher import Finisher, OidnOpening, fill
 from .gpu.context import GpuFailed
 from .limits import bounded_scene, bounded_state
@@ -78,12 +78,14 @@ class Session:
         guide: Sequence[FrameState] = (),
         live: LiveSettings | None = None,
         oidn_paths: Sequence[Path] = (),
+        choices: ChoiceFile | None = None,
         report: Report = silent,
     ) -> None:
         """``state`` is the first frame to bake. ``guide``: frames spread over the animation, whose light tells where
         gather rays are aimed in all of them; default: the first alone. ``live``: frames after the first update no more
         than its budget allows; without it every frame's maps are converged, and hang on these arguments and the frame's
         own state, never on which frames were lit before it. ``oidn_paths``: where Open Image Denoise's library may lie.
+        ``choices``: where gather AUTO notes what it measured; without it, it is links.
 
         Raises BakeError when the settings ask for what this machine does not have.
         """
@@ -93,7 +95,7 @@ class Session:
         self._report = report
         oidn = OidnOpening(settings, oidn_paths)
         self._workers = Workers(settings.threads)
-        self._gathers = Gathers(settings, self._workers)
+        self._gathers = Gathers(settings, self._workers, choices)
         self._live = live
         self._broken = False  # a frame was cut short: what is kept may be of two frames
         try:
@@ -111,7 +113,11 @@ class Session:
         self._outside = OutsideLight(self._placed, self.atlas, self.settings)
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
-        self._gathers.choose(self._guide(states[1:] or states))
+        bright, sent = self._guide(states[1:] or states)
+        self._gathers.choose(self._placed, bright, sent, self._first_samples())
+        if self._gathers.gather is Gather.RAYS and self.settings.gather is Gather.AUTO:
+            self._placed.trace_with(self._gathers.make_tracer)
+            self._outside.forget()
         self._lighting = Lighting(self.settings, self._gathers.make, self._live)
 
     @property
@@ -211,7 +217,7 @@ class Session:
         if self._gathers.gather is Gather.LINKS:
             stats.cosine_rays, stats.bright_rays = samples.cosine, samples.bright
         else:
-            stats.view_pixels = view_size(samples)
+            stats.view_pixels = self._gathers.pixels(samples)
         with stats.stage("links"):
             links = lighting.gather(placed, samples, stats)
         self._report("links", 4, STAGE_COUNT)
@@ -237,8 +243,9 @@ class Session:
 
     # --- stages ---------------------------------------------------------------------------------------------------
 
-    def _guide(self, states: Sequence[FrameState]) -> BrightTargets:
-        """Where gather rays are aimed: at what shines in any of ``states``."""
+    def _guide(self, states: Sequence[FrameState]) -> tuple[BrightTargets, Float32]:
+        """(where gather rays are aimed: at what shines in any of ``states``; (m, 3) what all targets send in the first,
+        before light has bounced)."""
         assert self._setup is not None
         placed, weights, setup = self._placed, [], self._setup
         seen = SurfaceGraph(self.texels.surface_count)
@@ -250,7 +257,7 @@ class Session:
             outside, _ = self._outside.light(change, setup, self._report, STAGE_COUNT)
             known = radiosity.sent_by_targets(outside, placed.albedo, placed.emitted)
             weights.append(bright_weight(known, placed.frame.area, placed.sky, placed.geometry.extent))
-        return bright_targets(weights, rooms_of(seen, self.texels.surface))
+        return bright_targets(weights, rooms_of(seen, self.texels.surface)), known
 
     def _pages(self, lit: _Lit, iim: Float32, caustic: Float32 | None) -> LightMaps:
         end, stand_in = self._finisher, lit.light.stand_in

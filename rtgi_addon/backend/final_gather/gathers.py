@@ -6,20 +6,27 @@ Where the GPU fails, :meth:`Gathers.give_up` goes over to links; their maps are 
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
+
+import numpy as np
+
 from ..gpu.compute_tracer import ComputeTracer
 from ..gpu.context import COMPUTE_VERSION, LEAST_VERSION, Gpu, GpuFailed, GpuUnavailable, open_gpu
 from ..parallel import Workers
 from ..placed import PlacedScene
-from ..scene import FrameState, Scene
+from ..scene import Float32, FrameState, Scene
 from ..settings import GPU_GATHERS, BakeSettings, Device, Gather, SampleCounts
 from ..surface.geometry import Geometry
 from ..surface.tracing import EmbreeTracer, FollowingTracer
 from .bright import BrightTargets
+from .choice import Choice, ChoiceFile, Makers, choose, scene_class
 from .coarse import CoarseMesh, coarse_mesh
+from .gather import GatherRays
 from .kept_gather import KeptGather
 from .link_gather import LinkGather
 from .view_gather import ViewGather, view_size
-from .views import make_view
+from .views import LEAST_SIZE, MOST_SIZE, make_view
 
 
 class Gathers:
@@ -28,12 +35,17 @@ class Gathers:
     ``notes``: lines for the user about what was not to be had.
     """
 
-    def __init__(self, settings: BakeSettings, workers: Workers) -> None:
-        """Opens the GPU where ``settings`` ask for one; without any that serves, everything is done by the CPU."""
+    def __init__(self, settings: BakeSettings, workers: Workers, choices: ChoiceFile | None = None) -> None:
+        """Opens the GPU where ``settings`` ask for one; without any that serves, everything is done by the CPU.
+
+        ``choices``: where the choice that AUTO makes is noted; without it AUTO is links, unless the device asked for is
+        a GPU.
+        """
         self._settings, self._workers = settings, workers
         self._bright: BrightTargets | None = None
         self._coarse: dict[int, CoarseMesh] | None = None
         self._gpu: Gpu | None = None
+        self._choices, self._scale = choices, 1.0
         self.notes: list[str] = []
         self.gather, self.reason = Gather.LINKS, ""
         if settings.device is not Device.GPU and settings.gather not in GPU_GATHERS:
@@ -45,18 +57,87 @@ class Gathers:
 
     def make_tracer(self, scene: Scene, geometry: Geometry, state: FrameState) -> FollowingTracer:
         """What traces rays, in the frame that ``geometry`` and ``state`` stand in."""
-        asked = self._settings.device is Device.GPU or self._settings.gather is Gather.RAYS
+        asked = self._settings.device is Device.GPU or Gather.RAYS in (self._settings.gather, self.gather)
         if self._gpu is None or not asked or not self._gpu.info.computes:
             return EmbreeTracer(scene, geometry, state, self._workers)
         return ComputeTracer(scene, geometry, state, self._gpu)
 
-    def choose(self, bright: BrightTargets) -> None:
-        """Settle which gather is made; ``bright``: what its rays are aimed at, where they are aimed."""
+    def choose(self, placed: PlacedScene, bright: BrightTargets, sent: Float32, samples: SampleCounts) -> None:
+        """Settle which gather is made.
+
+        bright: what links' rays are aimed at · sent (m, 3): radiosity of all targets in the frame of ``placed`` ·
+        samples: that frames will first ask for.
+        """
         self._bright = bright
         asked = self._settings.gather
-        if self._gpu is not None and asked is not Gather.AUTO:
-            self.gather = asked
-        self.reason = self.reason or "asked for"
+        if asked is not Gather.AUTO:
+            self.gather = asked if self._gpu is not None else Gather.LINKS
+            self.reason = self.reason or "asked for"
+        elif self._settings.device is Device.CPU:
+            self.reason = "the device asked for is the CPU"
+        elif self._choices is None and self._settings.device is not Device.GPU:
+            self.reason = "nothing was measured: no file of choices was given"
+        elif names := passing_materials(placed):
+            self.reason = f"{names}: only links follow rays through mirrors, glass and what is not opaque"
+        else:
+            self._measure(placed, sent, samples)
+
+    def _measure(self, placed: PlacedScene, sent: Float32, samples: SampleCounts) -> None:
+        """Take the choice that is noted for scenes like this, or measure and note one."""
+        key = scene_class(placed, samples, self._workers.count)
+        known = self._choices.get(key) if self._choices is not None else None
+        choice = known if known is not None and known.gather is Gather.LINKS else None
+        if choice is None or self._settings.device is Device.GPU:
+            try:
+                self._gpu = self._gpu or open_gpu()
+            except GpuUnavailable as fault:
+                self.reason = f"no GPU: {fault}"
+                return
+            renderer = self._gpu.info.renderer
+            choice = known if known is not None and known.renderer == renderer else None
+        if choice is None:
+            assert self._gpu is not None
+            choice = self._measured(placed, sent, samples, self._gpu)
+            if self._choices is not None:
+                self._choices.note(key, choice)
+        self.gather, self.reason, self._scale = choice.gather, choice.reason, choice.scale
+        if self.gather is Gather.LINKS and self._settings.device is not Device.GPU:
+            self.close()
+
+    def _measured(self, placed: PlacedScene, sent: Float32, samples: SampleCounts, gpu: Gpu) -> Choice:
+        rays = [Gather.RAYS] if gpu.info.computes else []
+        try:
+            makers = Makers(self._gather_rays(placed), self._tried_views(placed, gpu), self._workers)
+            return choose(placed, sent, samples, makers, [*rays, Gather.HEMICUBE, Gather.PLANE], gpu.info.renderer)
+        except GpuFailed as fault:
+            return Choice(Gather.LINKS, f"the GPU failed: {fault}", renderer=gpu.info.renderer)
+
+    def _gather_rays(self, placed: PlacedScene) -> Callable[[SampleCounts, int], GatherRays]:
+        assert self._bright is not None
+        bright, settings = self._bright, self._settings
+        return lambda samples, seed: GatherRays(
+            placed.texels, placed.frame, placed.geometry, placed.surfaces, placed.tracer, placed.sky, bright, samples,
+            max_specular=settings.max_specular, seed=settings.seed + seed,
+        )  # fmt: skip
+
+    def _tried_views(
+        self, placed: PlacedScene, gpu: Gpu
+    ) -> Callable[[Gather, int], AbstractContextManager[ViewGather]]:
+        @contextmanager
+        def views(kind: Gather, size: int) -> Iterator[ViewGather]:
+            before = placed.tracer
+            if kind is Gather.RAYS and not isinstance(before, ComputeTracer):
+                placed.tracer = ComputeTracer(placed.scene, placed.geometry, placed.state, gpu)
+            try:
+                gather = self._view_gather(kind, size, placed, gpu, memory=0)
+                yield gather
+                gather.release()
+            finally:
+                if isinstance(placed.tracer, ComputeTracer) and placed.tracer is not before:
+                    placed.tracer.close()
+                placed.tracer = before
+
+        return views
 
     def make(self, placed: PlacedScene, samples: SampleCounts, memory: int) -> KeptGather:
         """A gather with ``samples``, or as many pixels as stand for them, that may keep ``memory`` bytes.
@@ -64,18 +145,26 @@ class Gathers:
         Raises GpuFailed where the scene does not fit the GPU.
         """
         settings = self._settings
-        if self.gather is Gather.LINKS or self._gpu is None:
-            assert self._bright is not None
-            return LinkGather(
-                placed, self._bright, samples, self._workers,
-                memory=memory, max_specular=settings.max_specular, seed=settings.seed,
-            )  # fmt: skip
-        view = make_view(self.gather, view_size(samples), settings.enlargement)
+        if self.gather is not Gather.LINKS and self._gpu is not None:
+            return self._view_gather(self.gather, self.pixels(samples), placed, self._gpu, memory=memory)
+        assert self._bright is not None
+        return LinkGather(
+            placed, self._bright, samples, self._workers,
+            memory=memory, max_specular=settings.max_specular, seed=settings.seed,
+        )  # fmt: skip
+
+    def pixels(self, samples: SampleCounts) -> int:
+        """Along a view that stands for ``samples``; 0: gathered by links."""
+        if self.gather is Gather.LINKS:
+            return 0
+        return int(min(max(view_size(samples) * self._scale, LEAST_SIZE), MOST_SIZE))
+
+    def _view_gather(self, kind: Gather, size: int, placed: PlacedScene, gpu: Gpu, *, memory: int) -> ViewGather:
+        settings = self._settings
         if self._coarse is None:
             self._coarse = stand_ins_of_meshes(placed, settings.stand_in_triangles)
-        return ViewGather(
-            placed, self._gpu, view, self._workers, memory=memory, coarse=self._coarse, seed=settings.seed
-        )
+        view = make_view(kind, size, settings.enlargement)
+        return ViewGather(placed, gpu, view, self._workers, memory=memory, coarse=self._coarse, seed=settings.seed)
 
     def give_up(self, fault: GpuFailed) -> None:
         """The GPU failed: from now on everything is done by the CPU."""
@@ -96,9 +185,8 @@ class Gathers:
         """What was not to be had, and what views leave out of the scene, a line each."""
         if self.gather is Gather.LINKS:
             return list(self.notes)
-        used = {int(m) for m in placed.geometry.material_of_triangle}
-        names = sorted(m.name for k, m in enumerate(placed.materials) if k in used and m.passes_rays)
-        passing = [f"{', '.join(names)}: gather {self.gather} {_PASSING}"] if names else []
+        names = passing_materials(placed)
+        passing = [f"{names}: gather {self.gather} {_PASSING}"] if names else []
         return [*self.notes, *passing]
 
     def stand_ins(self, placed: PlacedScene) -> dict[str, dict[str, float]]:
@@ -122,6 +210,12 @@ def _computes(settings: BakeSettings) -> bool:
 
 
 _PASSING = "sees mirrors, glass and what lets light through as plain surfaces; --gather links follows them"
+
+
+def passing_materials(placed: PlacedScene) -> str:
+    """Names of the materials in use that rays go on from undiffused; "": there are none."""
+    used = set(np.unique(placed.geometry.material_of_triangle).tolist())
+    return ", ".join(sorted(m.name for k, m in enumerate(placed.materials) if k in used and m.passes_rays))
 
 
 def stand_ins_of_meshes(placed: PlacedScene, most: int) -> dict[int, CoarseMesh]:

@@ -7,6 +7,7 @@ moving lamps nothing is drawn. What does not fit the memory allowed is drawn ane
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
@@ -191,6 +192,26 @@ class ViewGather:
             for half, sums in zip(halves, self._drawn_again(texels[rows].astype(np.int32)), strict=True):
                 half[rows] = sums
         return halves[0], halves[1]
+
+    def lit_once(self, texel: Int32, radiosity: Float32, products: int) -> tuple[Float32, float]:
+        """((k, 3) irradiance of ``texel`` (k,), rising, seconds for drawing their views and so many products). Nothing
+        of it is kept. Once before, unmeasured, so that no shader is compiled meanwhile."""
+        self._look(texel)
+        self._sums.send(self._entries.sent(radiosity, None))
+        parts = [texel[at : at + self._spare_tiles()] for at in range(0, len(texel), self._spare_tiles())]
+        halves = np.concatenate([sum(self._drawn_again(part)) for part in parts])
+        seconds = 0.0
+        for part in parts:
+            start = time.perf_counter()
+            self._drawn_again(part)
+            drawn = time.perf_counter()
+            assert self._spare is not None
+            self._sums.sums(self._spare.target, self._spare.triangle)
+            summed = time.perf_counter() - drawn
+            # A sum takes a target's time whether all of its tiles hold anything or not.
+            share = len(part) / self._spare.target.tiles
+            seconds += drawn - start - summed + products * summed * share
+        return halves[:, :3] * _inverse(halves[:, 3:]), seconds
 
     def _spare_tiles(self) -> int:
         return self._targets[0].target.tiles if self._targets else self._fitting(self.count).tiles
