@@ -179,7 +179,10 @@ def settings_of(arguments: argparse.Namespace) -> BakeSettings:
 
 def typed_settings(values: Mapping[str, Any]) -> BakeSettings:
     """Settings from ``values`` by field name, words for the enumerated ones; other keys are ignored."""
-    return BakeSettings(**{f.name: values[f.name] for f in fields(BakeSettings)})
+    try:
+        return BakeSettings(**{f.name: values[f.name] for f in fields(BakeSettings)})
+    except ValueError as fault:  # each is in its range, but not all go together
+        raise BakeError(str(fault)) from None
 
 
 def frames_of(text: str | None) -> Sequence[int] | None:

@@ -4,7 +4,9 @@
 from __future__ import annotations
 
 import importlib.metadata
+import os
 import platform
+import sys
 import tomllib
 from pathlib import Path
 
@@ -14,6 +16,7 @@ from .backend.parallel import thread_count
 
 #: Whose version may change the last bits of a map.
 PACKAGES = ("numpy", "scipy", "embreex", "xatlas")
+CHOICES = "gathers.json"
 
 
 def versions() -> dict[str, str]:
@@ -30,6 +33,17 @@ def versions() -> dict[str, str]:
 def device(threads: int) -> dict[str, str | int]:
     """The machine part that computes. ``threads`` as in the settings."""
     return {"kind": "cpu", "name": _processor(), "threads": thread_count(threads), "system": platform.platform()}
+
+
+def choices_file() -> Path:
+    """Where gather AUTO notes what it measured on this machine: in the extension's own folder, or, when the add-on is
+    run as a module, in the user's folder of caches."""
+    package = (__package__ or "").removesuffix(".rtgi_addon")
+    if package.startswith("bl_ext."):
+        return Path(bpy.utils.extension_path_user(package)) / CHOICES
+    home = Path.home()
+    caches = {"win32": home / "AppData" / "Local", "darwin": home / "Library" / "Caches"}.get(sys.platform)
+    return (caches or Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")) / "rtgi" / CHOICES
 
 
 def library_folders() -> list[Path]:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend.errors import BakeError, Cancelled
+from .backend.final_gather.choice import ChoiceFile
 from .backend.lamps.lights import is_dark
 from .backend.progress import Report
 from .backend.scene import Atlas, FrameState, LightMaps, Material, Scene
@@ -25,7 +26,7 @@ from .backend.session import Session
 from .backend.stats import FrameStats
 from .backend.surface.geometry import Geometry
 from .backend.surface.texels import Texels, place_texels
-from .environment import device, library_folders, versions
+from .environment import choices_file, device, library_folders, versions
 from .exr import write_page
 from .extract import frame_state
 from .job import Plan
@@ -98,6 +99,7 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
         for index, frame in enumerate(plan.frames):
             listener.frame_begins(frame, index, len(plan.frames))
             records.append(_frame(plan, folder, session, index))
+            _require_one_gather(records)
             listener.frame_done(frame, records[-1])
             for text in records[-1]["warnings"]:
                 if text not in said:  # what holds for every frame is said once
@@ -110,10 +112,20 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
     return records
 
 
+def _require_one_gather(records: Sequence[dict[str, Any]]) -> None:
+    """Raises BakeError where frames kept of an earlier run were gathered in another way: maps would change midway."""
+    kept = {(r["gather"], r["view_pixels"]) for r in records if r["kept"]}
+    last = records[-1]
+    if kept and not last["kept"] and (last["gather"], last["view_pixels"]) not in kept:
+        ways = ", ".join(sorted(gather for gather, _ in kept))
+        remedy = f"name one: --gather {ways}, or bake anew without --resume"
+        raise BakeError(f"frame {last['frame']}: gathered by {last['gather']}, the frames kept by {ways}; {remedy}")
+
+
 def _session(plan: Plan, listener: Listener) -> Session:
     return Session(
         plan.scene, plan.atlas, plan.job.settings, plan.states[0], guide=plan.guide, oidn_paths=library_folders(),
-        report=listener.report,
+        choices=ChoiceFile(choices_file()), report=listener.report,
     )  # fmt: skip
 
 

@@ -114,7 +114,8 @@ class Session:
         self._setup: FrameStats | None = FrameStats()  # what the guide took: counted with the first frame
         # The first frame's state comes last, so that it need not be placed again.
         bright, sent = self._guide(states[1:] or states)
-        self._gathers.choose(self._placed, bright, sent, self._first_samples())
+        with self._setup.stage("choose"):
+            self._gathers.choose(self._placed, bright, sent, self._first_samples())
         if self._gathers.gather is Gather.RAYS and self.settings.gather is Gather.AUTO:
             self._placed.trace_with(self._gathers.make_tracer)
             self._outside.forget()
@@ -162,7 +163,9 @@ class Session:
         traced_in_setup, stats.photons_kept = stats.photons_traced, 0
         state, bounded = bounded_state(state, self.scene)
         stats.warnings += dict.fromkeys([*self._gathers.warnings(self._placed), *self._bounded, *bounded])
-        stats.gather, stats.gather_reason = self._gathers.gather, self._gathers.reason
+        gathers = self._gathers
+        stats.gather, stats.gather_reason, stats.device = gathers.gather, gathers.reason, gathers.device
+        stats.stand_ins = gathers.stand_ins(self._placed)
         with stats.stage("place"):
             change = self._placed.follow(state)
             if self.settings.selection is Selection.OFF:

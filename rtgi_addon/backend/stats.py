@@ -30,10 +30,12 @@ class FrameStats:
     surfaces_kept: int = 0
     gather: str = "links"
     gather_reason: str = ""  # why this one
+    device: str = "cpu"  # what traced and gathered: cpu, or the GPU's name
     view_pixels: int = 0  # along a side of a view, of gathers that draw
     cosine_rays: int = 0  # per texel
     bright_rays: int = 0  # per texel
     estimated_error: float | None = None  # relative RMS error of the IIM; None where the IIM is black
+    stand_ins: dict[str, dict[str, float]] = field(default_factory=dict)  # by object, see Gathers.stand_ins
     warnings: list[str] = field(default_factory=list)
 
     @contextmanager

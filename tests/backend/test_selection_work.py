@@ -220,7 +220,8 @@ def test_a_door_that_opens_lets_light_in() -> None:
 
 def _resting(stats: FrameStats) -> dict:
     """What the stats of a frame without work may hold."""
-    names = ("seconds", "links_kept", "texels_kept", "surfaces_kept", "photons_kept", "gather", "cosine_rays",
+    names = ("seconds", "links_kept", "texels_kept", "surfaces_kept", "photons_kept", "gather", "gather_reason",
+             "cosine_rays",
              "bright_rays", "estimated_error", "warnings")  # fmt: skip
     return {name: getattr(stats, name) for name in names}
 

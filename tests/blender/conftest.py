@@ -7,11 +7,22 @@ start-up file and add-ons cannot change a result.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import bpy
 import numpy as np
 import pytest
+
+
+@pytest.fixture(scope="session", autouse=True)
+def caches_apart(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """What bakes note about this machine goes to a folder of the tests', here and in child processes; Mesa's compiled
+    shaders, which take half a minute, stay where they are."""
+    caches = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    os.environ.setdefault("MESA_SHADER_CACHE_DIR", caches)
+    os.environ["XDG_CACHE_HOME"] = str(tmp_path_factory.mktemp("caches"))
 
 
 @pytest.fixture(scope="session", autouse=True)

@@ -153,6 +153,12 @@ class Gathers:
             memory=memory, max_specular=settings.max_specular, seed=settings.seed,
         )  # fmt: skip
 
+    @property
+    def device(self) -> str:
+        """What traces and gathers: cpu, or the GPU's name."""
+        uses_gpu = self.gather is not Gather.LINKS or self._settings.device is Device.GPU
+        return self._gpu.info.renderer if self._gpu is not None and uses_gpu else "cpu"
+
     def pixels(self, samples: SampleCounts) -> int:
         """Along a view that stands for ``samples``; 0: gathered by links."""
         if self.gather is Gather.LINKS:
