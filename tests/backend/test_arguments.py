@@ -67,9 +67,8 @@ def test_every_value_out_of_range_is_told_at_once() -> None:
     [
         [],
         ["bake", "a.blend", "--quality", "best"],
-        ["bake", "a.blend", "--gather", "plane"],  # the design's, not there yet
-        ["bake", "a.blend", "--gather", "hemicube"],
-        ["bake", "a.blend", "--device", "gpu"],
+        ["bake", "a.blend", "--gather", "lightcuts"],
+        ["bake", "a.blend", "--device", "fpga"],
         ["bake", "a.blend", "--no-selective", "--selection", "swept"],
         ["bake", "a.blend", "--resolution", "1k"],
         ["bake", "a.blend", "--resolution", "64", "--density", "10"],

@@ -223,8 +223,10 @@ def test_a_refusal_in_json_is_one_line_on_stdout(tmp_path: Path, capfd: pytest.C
 
 
 def test_usage_errors_and_help(capfd: pytest.CaptureFixture[str]) -> None:
-    (line,) = refused(capfd, "a.blend", "--gather", "plane")
+    (line,) = refused(capfd, "a.blend", "--gather", "lightcuts")
     assert "--gather" in line
+    (line,) = refused(capfd, "a.blend", "--gather", "plane", "--device", "cpu")
+    assert "plane" in line and "GPU" in line
     assert run(["bake", "--help"]) == 0
     assert "--target-error" in capfd.readouterr().out
 
