@@ -64,6 +64,11 @@ class LinkStore:
         self._cosine_slots, self._aimed_slots = _slots(rays.n_cosine, rays.n_bright)
 
     @property
+    def opened(self) -> Bool:
+        """(n, POINTS) which points of each texel lie in its open part; not to be written to."""
+        return self._opened
+
+    @property
     def bytes(self) -> int:
         """Memory that the kept links take."""
         return self.target.nbytes + self.weight.nbytes + self._distance.nbytes + self._pending.nbytes

@@ -16,18 +16,18 @@ from numpy.typing import NDArray
 
 from ..gpu.compute_tracer import ComputeTracer
 from ..gpu.context import Gpu, GpuFailed
-from ..parallel import CHUNK_RAYS, Workers
+from ..parallel import Workers
 from ..placed import PlacedScene
 from ..sampling import dot, frames, hash_keys, unit_float32
 from ..scene import Bool, Float32, FrameState, Int32
 from ..selection.changes import Change
 from ..settings import Gather, SampleCounts
-from ..surface.rasterise import POINTS
 from ..surface.texels import stand_ins
 from .bright import BrightTargets
 from .coarse import CoarseMesh
 from .gather import GatherRays
 from .kept_gather import GatherWork
+from .link_store import LinkStore
 from .links import MOST_HALF_SCALE
 from .openness import open_texels
 from .patterns import TILE, pattern_of_texels
@@ -78,7 +78,7 @@ class ViewGather:
 
         Raises GpuFailed where the scene does not fit the device, here and in every call.
         """
-        self._placed, self._gpu, self._view, self._workers = placed, gpu, view, workers
+        self._placed, self._gpu, self._view = placed, gpu, view
         texels = placed.texels
         self._probe = GatherRays(
             texels, placed.frame, placed.geometry, placed.surfaces, placed.tracer, placed.sky, nothing_bright(placed),
@@ -96,7 +96,8 @@ class ViewGather:
         # A device that has compute shaders sums faster by them; software does not.
         by_groups = gpu.info.computes and not gpu.info.software
         self._sums = ViewSums(gpu, view, self._entries.count, by_groups=by_groups)
-        self._open = _Opened(texels.count)
+        # Which part of a texel is open hangs on what its probes meet; they are kept and followed as links are.
+        self._opening = LinkStore(self._probe, workers, memory=1 << 62)
         self._pending = np.ones(texels.count, np.bool_)
         self._targets = self._make_targets(memory)
         self._spare: _ViewTarget | None = None
@@ -120,12 +121,13 @@ class ViewGather:
 
     @property
     def pending(self) -> Bool:
-        return self._pending.copy()
+        return np.asarray(self._pending | self._opening.pending)
 
     def follow(self, placed: PlacedScene, change: Change) -> int:
         self._probe.follow(change.texels, placed.surfaces)
         if not change.sweep.any:
             return 0
+        self._opening.disturb(self._probe, change.sweep, placed.frame.reach)
         self._source.follow(np.flatnonzero(change.sweep.moved), placed.state)
         self._pending |= change.texels
         frame = placed.frame
@@ -135,12 +137,9 @@ class ViewGather:
         return 0
 
     def renew(self, texel: Int32) -> GatherWork:
-        work = GatherWork(np.zeros(self.count, np.bool_))
-        texel = texel[self._pending[texel]]
-        parts = self._workers.map_slices(
-            lambda rows: self._look(texel[rows]), len(texel), max(1, CHUNK_RAYS // PROBES.total)
-        )
-        work.traced, work.drawn = sum(parts), len(texel)
+        texel = texel[self.pending[texel]]
+        work = GatherWork(np.zeros(self.count, np.bool_), drawn=len(texel))
+        work.traced = self._opening.renew(self._probe, texel).traced
         work.changed[texel] = True
         first = 0
         for kept in self._targets:
@@ -161,7 +160,7 @@ class ViewGather:
 
     def irradiance(self) -> ViewIrradiance:
         texels = self._placed.texels
-        stand_in = stand_ins(texels, open_texels(texels, self._open.free))
+        stand_in = stand_ins(texels, open_texels(texels, self._opening.free))
         patches = np.arange(self._probe.target_count - self.count, dtype=np.int32) + np.int32(self.count)
         themselves = np.arange(self.count, dtype=np.int32)
         shown = None
@@ -196,7 +195,7 @@ class ViewGather:
     def lit_once(self, texel: Int32, radiosity: Float32, products: int) -> tuple[Float32, float]:
         """((k, 3) irradiance of ``texel`` (k,), rising, seconds for drawing their views and so many products). Nothing
         of it is kept. Once before, unmeasured, so that no shader is compiled meanwhile."""
-        self._look(texel)
+        self._opening.renew(self._probe, texel)
         self._sums.send(self._entries.sent(radiosity, None))
         parts = [texel[at : at + self._spare_tiles()] for at in range(0, len(texel), self._spare_tiles())]
         halves = np.concatenate([sum(self._drawn_again(part)) for part in parts])
@@ -241,17 +240,11 @@ class ViewGather:
         across = max(1, min(side // self._view.width, count))
         return _Shape(self._view, across, max(1, min(side // self._view.height, -(-count // across))))
 
-    def _look(self, texel: Int32) -> int:
-        """Which points of ``texel`` (m,) lie in the open; rays traced."""
-        traced = self._probe.trace(texel)
-        self._open.points[texel], self._open.free[texel] = traced.opened, traced.free
-        return traced.rays
-
     def _eyes(self, texel: Int32) -> Eyes:
         """Where the views of ``texel`` (m,) are taken from: its middle, where it is flat and wholly in the open, else
         the point in the open nearest to the middle of those."""
         frame, texels = self._placed.frame, self._placed.texels
-        points, opened = frame.points[texel], self._open.points[texel]
+        points, opened = frame.points[texel], self._opening.opened[texel]
         share = opened / np.maximum(opened.sum(axis=1, keepdims=True), 1)
         middle = np.asarray((points * share[:, :, None]).sum(axis=1), np.float32)
         away = ((points - middle[:, None]) ** 2).sum(axis=2)
@@ -338,14 +331,6 @@ class _ViewTarget:
     def release(self) -> None:
         self.target.release()
         self._gpu.release(self.triangle)
-
-
-class _Opened:
-    """What probes tell of n texels."""
-
-    def __init__(self, count: int) -> None:
-        self.points: Bool = np.ones((count, POINTS), np.bool_)  # which lie in the texel's open part
-        self.free: Float32 = np.ones(count, np.float32)  # share of rays that end on no dark side
 
 
 def nothing_bright(placed: PlacedScene) -> BrightTargets:
