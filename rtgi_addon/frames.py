@@ -99,7 +99,7 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
         for index, frame in enumerate(plan.frames):
             listener.frame_begins(frame, index, len(plan.frames))
             records.append(_frame(plan, folder, session, index))
-            _require_one_gather(records)
+            _require_one_gather(records, frame)
             listener.frame_done(frame, records[-1])
             for text in records[-1]["warnings"]:
                 if text not in said:  # what holds for every frame is said once
@@ -112,14 +112,14 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
     return records
 
 
-def _require_one_gather(records: Sequence[dict[str, Any]]) -> None:
+def _require_one_gather(records: Sequence[dict[str, Any]], frame: int) -> None:
     """Raises BakeError where frames kept of an earlier run were gathered in another way: maps would change midway."""
     kept = {(r["gather"], r["view_pixels"]) for r in records if r["kept"]}
     last = records[-1]
     if kept and not last["kept"] and (last["gather"], last["view_pixels"]) not in kept:
         ways = ", ".join(sorted(gather for gather, _ in kept))
-        remedy = f"name one: --gather {ways}, or bake anew without --resume"
-        raise BakeError(f"frame {last['frame']}: gathered by {last['gather']}, the frames kept by {ways}; {remedy}")
+        remedy = "bake anew without --resume, with the gather named by --gather"
+        raise BakeError(f"frame {frame}: gathered by {last['gather']}, the frames kept by {ways}; {remedy}")
 
 
 def _session(plan: Plan, listener: Listener) -> Session:

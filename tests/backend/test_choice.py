@@ -106,7 +106,7 @@ def test_without_light_nothing_is_measured() -> None:
 def test_scenes_of_a_size_are_one_class_and_others_are_not() -> None:
     def key(texels: int, samples: SampleCounts = SAMPLES) -> str:
         scene, atlas = cornell(texels)
-        return scene_class(PlacedScene(scene, atlas, scene.first_frame(), (), Workers(1)), samples, 2)
+        return scene_class(PlacedScene(scene, atlas, scene.first_frame(), (), Workers(1)), samples)
 
     assert key(24) == key(25) != key(48)
     assert key(24) != key(24, SampleCounts(32, 32))
@@ -170,7 +170,7 @@ def test_links_that_are_noted_open_no_gpu(tmp_path: Path, monkeypatch) -> None:
     file = ChoiceFile(tmp_path / "gathers.json")
     scene, atlas = cornell(12)
     placed = PlacedScene(scene, atlas, scene.first_frame(), (), Workers(0))
-    file.note(scene_class(placed, SampleCounts(8, 8), placed.workers.count), Choice(Gather.LINKS, "measured before"))
+    file.note(scene_class(placed, SampleCounts(8, 8)), Choice(Gather.LINKS, "measured before"))
     assert frame_of(file).stats.gather_reason == "measured before"
 
 

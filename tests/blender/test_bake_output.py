@@ -267,6 +267,24 @@ def test_resuming_with_another_scene_or_setting_says_what_differs(
     assert "the lamps changed" in refusal()
 
 
+def test_a_resumed_bake_does_not_change_its_gather_midway(
+    scene_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Gather auto takes what is fastest here; frames kept of another choice, made elsewhere, would not go with it."""
+    out = tmp_path / "out"
+    assert bake_to(out, scene_file) == 0
+    record = record_of(out)
+    assert {frame["gather"] for frame in record["frames"].values()} == {"links"}
+    del record["frames"]["3"]
+    for frame in record["frames"].values():
+        frame["gather"], frame["view_pixels"] = "rays", 32
+    (out / "bake.json").write_text(json.dumps(record))
+    capfd.readouterr()
+    assert bake_to(out, scene_file, "--resume") == 3
+    (line,) = [text for text in capfd.readouterr().err.splitlines() if text.startswith("error: ")]
+    assert "gathered by links, the frames kept by rays" in line and "--gather" in line
+
+
 def test_a_frame_that_cannot_be_written_fails_the_bake_and_keeps_those_before(
     scene_file: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

@@ -294,7 +294,7 @@ def test_same_bits_for_any_batch_order_and_run(compute_gpu):
     pair = Pair(compute_gpu, scene)
     origins, directions = random_rays(3 * FEWEST_RAYS + 77)
     whole = pair.compute.intersect(origins, directions)
-    pair.compute._rays.batch = FEWEST_RAYS
+    pair.compute._rays.pace.items = FEWEST_RAYS
     again = Pair(compute_gpu, scene).compute
     picked = np.random.default_rng(0).permutation(len(origins))[:5001]
     for name in COLUMNS:
@@ -307,18 +307,18 @@ def test_same_bits_for_any_batch_order_and_run(compute_gpu):
 
 def test_batches_adapt_to_the_time_they_take(compute_gpu):
     rays = Pair(compute_gpu, cornell()).compute._rays
-    rays.batch = 1 << 14
-    rays._adapt(1 << 14, 0.3)
-    assert rays.batch == 1 << 13
-    rays._adapt(1 << 13, 0.001)
-    rays._adapt(1 << 13, 0.001)  # a batch that was not full says nothing
-    assert rays.batch == 1 << 14
+    rays.pace.items = 1 << 14
+    rays.pace.took(1 << 14, 0.3)
+    assert rays.pace.items == 1 << 13
+    rays.pace.took(1 << 13, 0.001)
+    rays.pace.took(1 << 13, 0.001)  # a batch that was not full says nothing
+    assert rays.pace.items == 1 << 14
     for _ in range(30):
-        rays._adapt(rays.batch, 0.3)
-    assert rays.batch == FEWEST_RAYS
+        rays.pace.took(rays.pace.items, 0.3)
+    assert rays.pace.items == FEWEST_RAYS
     for _ in range(30):
-        rays._adapt(rays.batch, 0.001)
-    assert rays.batch * compute_tracer.RAY.itemsize <= compute_gpu.info.max_storage
+        rays.pace.took(rays.pace.items, 0.001)
+    assert rays.pace.items * compute_tracer.RAY.itemsize <= compute_gpu.info.max_storage
 
 
 def test_threads_may_call_at_once(compute_gpu):

@@ -111,13 +111,14 @@ class ChoiceFile:
         return dict(known["choices"]) if right else {}
 
 
-def scene_class(placed: PlacedScene, samples: SampleCounts, threads: int) -> str:
-    """What a choice hangs on, in words: the machine, and the scene's sizes to a factor of four."""
+def scene_class(placed: PlacedScene, samples: SampleCounts) -> str:
+    """What a choice hangs on, in words: the machine, and the scene's sizes to a factor of four. Not the threads: maps
+    hang on the choice, and must not hang on those."""
     triangles, texels = (
         4 ** round(math.log(max(n, 1), 4)) for n in (placed.geometry.triangle_count, placed.texels.count)
     )
     sky = "open" if placed.sky is not None else "no sky"
-    return f"{platform.node()}, {threads} threads: {triangles} triangles, {texels} texels, {samples.total} rays, {sky}"
+    return f"{platform.node()}: {triangles} triangles, {texels} texels, {samples.total} rays, {sky}"
 
 
 def choose(

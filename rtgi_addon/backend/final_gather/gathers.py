@@ -84,7 +84,7 @@ class Gathers:
 
     def _measure(self, placed: PlacedScene, sent: Float32, samples: SampleCounts) -> None:
         """Take the choice that is noted for scenes like this, or measure and note one."""
-        key = scene_class(placed, samples, self._workers.count)
+        key = scene_class(placed, samples)
         known = self._choices.get(key) if self._choices is not None else None
         choice = known if known is not None and known.gather is Gather.LINKS else None
         if choice is None or self._settings.device is Device.GPU:

@@ -41,6 +41,8 @@ from .views import LEAST_SIZE, MOST_SIZE, View
 PROBES = SampleCounts(32, 0)
 #: Sides of a target, pixels: software draws fastest into what stays in a core's cache.
 SOFTWARE_SIDE, HARDWARE_SIDE = 1024, 4096
+#: Targets given back where memory ran out: for one to draw anew into, its depths, and sums.
+SPARED_TARGETS = 3
 #: Normals of a flat texel's points, and of a texel and its triangle, differ by less.
 FLAT = np.float32(1e-4)
 
@@ -232,7 +234,15 @@ class ViewGather:
         shape = self._fitting(self.count)
         each = 4 * shape.tiles * self._view.width * self._view.height
         number = min(-(-self.count // shape.tiles), memory // each)
-        return [_ViewTarget(self._gpu, shape, self._tilted) for _ in range(number)]
+        targets: list[_ViewTarget] = []
+        try:
+            while len(targets) < number:
+                targets.append(_ViewTarget(self._gpu, shape, self._tilted))
+        except GpuFailed:  # the device has less: room is left for what draws the others, product by product
+            for target in targets[-SPARED_TARGETS:]:
+                target.release()
+            del targets[-SPARED_TARGETS:]
+        return targets
 
     def _fitting(self, count: int) -> _Shape:
         """Tiles across and down a target; no larger than ``count`` texels need."""

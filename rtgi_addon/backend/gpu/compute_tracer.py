@@ -11,7 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
@@ -34,6 +33,7 @@ from ..surface.tracing import (
 )
 from .bvh import MAX_DEPTH, MAX_TRIANGLES, NODE, TRIANGLE, Bvh, build_bvh, pack_nodes, pack_triangles
 from .context import Gpu, GpuFailed
+from .pace import Pace
 from .programs import compute_program
 
 #: What a pass that includes ``inc/bvh.glsl`` is compiled with. Bindings from ``FIRST_FREE_BINDING`` on are its own.
@@ -48,10 +48,6 @@ FIRST_FREE_BINDING = 3
 
 #: Rays of a group: two of the widest hardware's waves.
 GROUP = 128
-#: A dispatch that ran longer than this is halved the next time, so that a desktop still answers, s ...
-LONGEST_DISPATCH = 0.1
-#: ... and one that ran shorter than this doubled.
-SHORTEST_DISPATCH = 0.04
 #: Rays of a dispatch: the fewest that fill a device, and the most, 2^15 groups of the 65535 that OpenGL promises.
 FEWEST_RAYS, FIRST_RAYS, MOST_RAYS = 1 << 12, 1 << 15, 1 << 22
 
@@ -273,7 +269,7 @@ class _RayBuffers:
         self._gpu = gpu
         most = min(MOST_RAYS, gpu.info.max_storage // RAY.itemsize)
         self._most = 1 << (most.bit_length() - 1)
-        self.batch = min(FIRST_RAYS, self._most)
+        self.pace = Pace(min(FEWEST_RAYS, self._most), self._most, FIRST_RAYS)
         self._size = 0
         self._rays: Any = None
         self._results: Any = None
@@ -282,10 +278,9 @@ class _RayBuffers:
         """Fill ``out`` (n,) by the results of ``rays`` (n,) RAY."""
         done = 0
         while done < len(rays):
-            rows = slice(done, min(done + self.batch, len(rays)))
-            begun = perf_counter()
-            self._dispatch(ctx, program, rays[rows], out[rows])
-            self._adapt(rows.stop - rows.start, perf_counter() - begun)
+            rows = slice(done, min(done + self.pace.items, len(rays)))
+            with self.pace.timed(rows.stop - rows.start):
+                self._dispatch(ctx, program, rays[rows], out[rows])
             done = rows.stop
 
     def release(self) -> None:
@@ -311,12 +306,6 @@ class _RayBuffers:
         self._rays = _storage(self._gpu, size * RAY.itemsize, "rays")
         self._results = _storage(self._gpu, size * HIT.itemsize, "hits")
         self._size = size
-
-    def _adapt(self, count: int, seconds: float) -> None:
-        if seconds > LONGEST_DISPATCH:
-            self.batch = max(self.batch // 2, min(FEWEST_RAYS, self._most))
-        elif seconds < SHORTEST_DISPATCH and count == self.batch:
-            self.batch = min(self.batch * 2, self._most)
 
 
 def _part(hierarchy: _Hierarchy, kind: np.uint8, place: Place | None) -> NDArray[np.void]:

@@ -23,7 +23,10 @@ class Pace:
         """Around a piece of ``items``, its waiting for the device included."""
         start = time.perf_counter()
         yield
-        seconds = time.perf_counter() - start
+        self.took(items, time.perf_counter() - start)
+
+    def took(self, items: int, seconds: float) -> None:
+        """A piece of ``items`` took ``seconds``. One that was not full says nothing about larger ones."""
         if seconds > LONG:
             self.items = max(self._least, self.items // 2)
         elif seconds < SHORT and items >= self.items:

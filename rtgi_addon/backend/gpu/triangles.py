@@ -142,7 +142,7 @@ def _corner_rows(texels: Texels, geometry: Geometry, corners: Corners) -> NDArra
 def _each_once(corners: Corners, rows: NDArray[Any]) -> tuple[NDArray[np.int64], Int32]:
     """((k,) corners of 3 c, each different one once, by instance; (c, 3) which of the k each corner is)."""
     # One number a corner: what it is told apart by, hashed; corners that differ in spite of it are all kept.
-    words = np.ascontiguousarray(rows).view(np.uint32).reshape(3 * len(rows), -1).astype(np.uint64)
+    words = np.ascontiguousarray(rows).view(np.uint32).reshape(3 * len(rows), CORNER.itemsize // 4).astype(np.uint64)
     instance = np.repeat(corners.instance, 3)
     vertex, key = corners.vertex.reshape(-1), instance.astype(np.uint64)
     for column in (vertex.astype(np.uint64), *words.T):
