@@ -98,8 +98,8 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
         session = _once(lambda: stack.enter_context(_session(plan, listener)))
         for index, frame in enumerate(plan.frames):
             listener.frame_begins(frame, index, len(plan.frames))
-            records.append(_frame(plan, folder, session, index))
-            _require_one_gather(records, frame)
+            kept = {(record["gather"], record["view_pixels"]) for record in records if record["kept"]}
+            records.append(_frame(plan, folder, session, index, kept))
             listener.frame_done(frame, records[-1])
             for text in records[-1]["warnings"]:
                 if text not in said:  # what holds for every frame is said once
@@ -112,14 +112,13 @@ def bake_frames(plan: Plan, folder: BakeFolder, listener: Listener) -> list[dict
     return records
 
 
-def _require_one_gather(records: Sequence[dict[str, Any]], frame: int) -> None:
-    """Raises BakeError where frames kept of an earlier run were gathered in another way: maps would change midway."""
-    kept = {(r["gather"], r["view_pixels"]) for r in records if r["kept"]}
-    last = records[-1]
-    if kept and not last["kept"] and (last["gather"], last["view_pixels"]) not in kept:
+def _require_one_gather(frame: int, stats: FrameStats, kept: set[tuple[str, int]]) -> None:
+    """Raises BakeError where the frames ``kept`` of an earlier run, their gathers and pixels, were gathered in another
+    way: the maps would change midway."""
+    if kept and (stats.gather, stats.view_pixels) not in kept:
         ways = ", ".join(sorted(gather for gather, _ in kept))
         remedy = "bake anew without --resume, with the gather named by --gather"
-        raise BakeError(f"frame {frame}: gathered by {last['gather']}, the frames kept by {ways}; {remedy}")
+        raise BakeError(f"frame {frame}: gathered by {stats.gather}, the frames kept by {ways}; {remedy}")
 
 
 def _session(plan: Plan, listener: Listener) -> Session:
@@ -141,7 +140,10 @@ def _once(make: Callable[[], Session]) -> Callable[[], Session]:
     return get
 
 
-def _frame(plan: Plan, folder: BakeFolder, session: Callable[[], Session], index: int) -> dict[str, Any]:
+def _frame(
+    plan: Plan, folder: BakeFolder, session: Callable[[], Session], index: int, kept: set[tuple[str, int]]
+) -> dict[str, Any]:
+    """The frame's record; ``kept``: gathers and pixels of the frames before that an earlier run left."""
     placing, frame = FrameStats(), plan.frames[index]
     with placing.stage("extract"):
         state = plan.states[index]
@@ -150,6 +152,7 @@ def _frame(plan: Plan, folder: BakeFolder, session: Callable[[], Session], index
         return {**finished, "kept": True}
     result = session().advance(state)
     stats = result.stats
+    _require_one_gather(frame, stats, kept)
     with stats.stage("write"):
         names = _write_maps(plan, result.maps)
     record = {**asdict(stats), "seconds": {**placing.seconds, **stats.seconds}, "state": key, "files": names}

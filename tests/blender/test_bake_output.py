@@ -283,6 +283,7 @@ def test_a_resumed_bake_does_not_change_its_gather_midway(
     assert bake_to(out, scene_file, "--resume") == 3
     (line,) = [text for text in capfd.readouterr().err.splitlines() if text.startswith("error: ")]
     assert "gathered by links, the frames kept by rays" in line and "--gather" in line
+    assert list(record_of(out)["frames"]) == ["1", "2"]
 
 
 def test_a_frame_that_cannot_be_written_fails_the_bake_and_keeps_those_before(
