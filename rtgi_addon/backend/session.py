@@ -90,7 +90,7 @@ class Session:
         Raises BakeError when the settings ask for what this machine does not have.
         """
         scene, self._bounded = bounded_scene(scene)
-        states = [bounded_state(s, scene)[0] for s in (state, *guide)]
+        self._states = [bounded_state(s, scene)[0] for s in (state, *guide)]
         self.scene, self.atlas, self.settings = scene, atlas, settings
         self._report = report
         oidn = OidnOpening(settings, oidn_paths)
@@ -99,10 +99,10 @@ class Session:
         self._live = live
         self._broken = False  # a frame was cut short: what is kept may be of two frames
         try:
-            self._set_up(states)
+            self._set_up(self._states)
         except GpuFailed as fault:
             self._gathers.give_up(fault)
-            self._set_up(states)
+            self._set_up(self._states)
         self._finisher = Finisher(scene, atlas, self.texels, settings, oidn)
 
     def _set_up(self, states: Sequence[FrameState]) -> None:
@@ -151,7 +151,8 @@ class Session:
             return self._advance(state)
         except GpuFailed as fault:
             self._gathers.give_up(fault)
-            self._placed.trace_with(self._gathers.make_tracer)
+            self._set_up(self._states)  # all anew: what links are aimed at may have been found by the GPU
+            self._broken = False
             return self._advance(state)
 
     def _advance(self, state: FrameState) -> FrameResult:
@@ -165,7 +166,6 @@ class Session:
         stats.warnings += dict.fromkeys([*self._gathers.warnings(self._placed), *self._bounded, *bounded])
         gathers = self._gathers
         stats.gather, stats.gather_reason, stats.device = gathers.gather, gathers.reason, gathers.device
-        stats.stand_ins = gathers.stand_ins(self._placed)
         with stats.stage("place"):
             change = self._placed.follow(state)
             if self.settings.selection is Selection.OFF:
@@ -182,6 +182,7 @@ class Session:
             maps = self._pages(lit, iim, caustic)
         self._report("pages", STAGE_COUNT, STAGE_COUNT)
         self._count(lit.light.updated, stats)
+        stats.stand_ins = gathers.stand_ins(self._placed)  # made with the first gather
         stats.photons_kept = max(stats.photons_kept - traced_in_setup, 0)
         stats.estimated_error = lit.estimated_error
         stats.warnings += self._finisher.warnings

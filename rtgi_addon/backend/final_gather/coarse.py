@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Simplified stand-ins of large meshes, for a gather that draws the scene from every texel.
 
-Far fewer rays leave a texel than a large mesh has triangles, so "the lowest level of detail for all objects might as
-well be chosen" (Larsen04 §9). Vertices are clustered on a uniform grid (Rossignac and Borrel 1993, "Multi-resolution 3D
+Far fewer rays leave a texel than a large mesh has triangles, so that its coarsest version serves a gather as well as
+any (Larsen04 §9). Vertices are clustered on a uniform grid (Rossignac and Borrel 1993, "Multi-resolution 3D
 approximations for rendering complex scenes"). Each corner of a triangle moves to the one vertex that stands for its
 cluster and keeps its own light-map UV. All corners at one place move together, so what was closed stays closed.
 """

@@ -215,9 +215,10 @@ class ViewRaster:
         where that has a stand-in."""
         scenery = self._scenery
         as_is = (scenery.instance == eyes.instance[0]) | ~self._has_coarse[scenery.instance]
-        rows = np.flatnonzero(scenery.shown & (as_is != scenery.coarse))
+        drawn = scenery.shown & (as_is != scenery.coarse)
+        rows = np.flatnonzero(drawn)
         rows = rows[in_front(scenery.centre[rows], scenery.radius[rows], eyes.eye, eyes.normal)]
-        return merged(scenery.begin[rows], scenery.end[rows])
+        return merged(scenery.begin[rows], scenery.end[rows], np.cumsum(~drawn)[rows])
 
     def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes, *, cleared: bool) -> None:
         rows = np.zeros(len(corner), EYE)
@@ -277,18 +278,20 @@ def padded(vectors: Float32) -> Float32:
     return np.concatenate([vectors, np.zeros((*vectors.shape[:-1], 1), np.float32)], axis=-1)
 
 
-def merged(begin: Int32, end: Int32) -> list[tuple[int, int]]:
-    """(first, count) of at most MOST_RANGES ranges that hold [begin, end) (k,): what touches is joined, and then what
-    lies nearest, with what is between."""
+def merged(begin: Int32, end: Int32, part: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """(first, count) of ranges that hold [begin, end) (k,), rising: what touches is joined, and then what lies nearest,
+    with what is between, until there are MOST_RANGES.
+
+    part (k,), rising: between ranges of different parts lies what must not be drawn; these are never joined.
+    """
     if not len(begin):
         return []
-    order = np.argsort(begin, kind="stable")
-    begin, end = begin[order], end[order]
-    gap = begin[1:] - end[:-1]
-    apart = gap > 0
+    gap, barred = begin[1:] - end[:-1], part[1:] != part[:-1]
+    apart = barred | (gap > 0)
     if np.count_nonzero(apart) >= MOST_RANGES:
-        apart = np.zeros(len(gap), np.bool_)
-        apart[np.argsort(-gap, kind="stable")[: MOST_RANGES - 1]] = True
+        by_width = np.argsort(np.where(barred, -np.inf, -gap), kind="stable")
+        apart = barred.copy()
+        apart[by_width[: MOST_RANGES - 1]] = True
     first, last = begin[np.append(True, apart)], end[np.append(apart, True)]
     return [(int(a), int(b - a)) for a, b in zip(first, last, strict=True)]
 
@@ -310,7 +313,7 @@ def _levels(geometry: Geometry, full: Corners, small: Corners) -> list[_Level]:
     ):
         clusters = make_clusters(geometry.corners.reshape(-1, 3)[place], corners.instance)
         levels.append(_Level(place, clusters, offset))
-    return [level for level in levels if level.clusters.count]
+    return levels
 
 
 def _places(geometry: Geometry, corners: Corners) -> Int32:

@@ -84,8 +84,7 @@ class ViewSums:
             weighed.build_mipmaps(0, level)
             # A view is as many squares high as its pixels have: the mean of each is one pixel of the level.
             means = np.frombuffer(weighed.read(level=level), np.float32)
-            for thing in (array, framebuffer, weighed):
-                thing.release()
+            self._gpu.release(array, framebuffer, weighed)
         squares = means.reshape(target.down, height // width, target.across, 4)
         return np.asarray(squares.sum(axis=1).reshape(-1, 4), np.float32)
 
