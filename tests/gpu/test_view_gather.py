@@ -289,9 +289,16 @@ def test_a_live_session_at_rest_shows_what_a_batch_does() -> None:
 def test_materials_that_pass_rays_are_named_in_one_line(gather: Gather) -> None:
     scene, atlas = stories.studio(4)
     result = bake(scene, atlas, replace(stories.BARE, gather=gather))[2]
-    lines = [line for line in result.stats.warnings if f"gather {gather}" in line]
+    lines = [line for line in result.stats.warnings if f"gather {gather} sees" in line]
     assert len(lines) == 1 and lines[0].startswith("glass, mirror, pane: ") and "links" in lines[0]
     assert not [line for line in bake(*scenes.cornell(4))[2].stats.warnings if "gather" in line]
+
+
+@pytest.mark.parametrize("gather", [Gather.HEMICUBE, Gather.PLANE])
+def test_what_a_plane_leaves_out_is_told(gather: Gather) -> None:
+    scene, atlas = scenes.cornell(4)
+    lines = bake(scene, atlas, replace(BARE, gather=gather))[2].stats.warnings
+    assert [line for line in lines if "grazing light" in line] == (lines if gather is Gather.PLANE else [])
 
 
 def test_a_session_is_closed_once_and_for_all() -> None:
