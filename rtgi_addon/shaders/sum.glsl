@@ -1,8 +1,9 @@
 #version 330 core
 // SPDX-License-Identifier: GPL-3.0-or-later
 // Pass "sum": one fragment a view adds up what its pixels bring, in order: Larsen04's equation 3, each half of the
-// pixels by itself, like the fields of a chessboard. The alpha of both is the weight of the pixels that count: those
-// that see what has a light of its own, and lie above the texel's own triangle.
+// pixels by itself, fields of a chessboard of 2 × 2 pixels, so that each holds all parts of a parted view. The alpha of
+// both is the weight of the pixels that count: those that see what has a light of its own, and lie above the texel's
+// own triangle.
 #ifndef VIEW_WIDTH
 #error Required define VIEW_WIDTH, for example 64: pixels across a view, a multiple of four
 #endif
@@ -39,7 +40,7 @@ void main()
     // Sums of rows first: a view of 64 × 192 pixels loses no digit to its length.
     vec4 total[2] = vec4[2](vec4(0.0), vec4(0.0));
     for (int y = 0; y < VIEW_HEIGHT; ++y) {
-        vec4 even = vec4(0.0), odd = vec4(0.0); // by column
+        vec4 even = vec4(0.0), odd = vec4(0.0); // by pair of columns
         for (int x = 0; x < VIEW_WIDTH; x += 4) {
             vec4 weight = weights_at(x, y);
             for (int k = 0; k < 4; ++k) {
@@ -48,14 +49,14 @@ void main()
 #if TILTED
                 counted = dot(texelFetch(directions, ivec2(x + k, y), 0).xyz, up) > 0.0 ? counted : vec4(0.0);
 #endif
-                if ((k & 1) == 0)
+                if (k < 2)
                     even += counted;
                 else
                     odd += counted;
             }
         }
-        total[0] += (y & 1) == 0 ? even : odd;
-        total[1] += (y & 1) == 0 ? odd : even;
+        total[0] += (y & 2) == 0 ? even : odd;
+        total[1] += (y & 2) == 0 ? odd : even;
     }
     first = total[0];
     second = total[1];

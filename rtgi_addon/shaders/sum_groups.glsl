@@ -49,7 +49,7 @@ void main()
 #if TILTED
             counts = counts && dot(texelFetch(directions, ivec2(x, y), 0).xyz, up) > 0.0;
 #endif
-            total[(x + y) & 1] += counts ? counted : vec4(0.0);
+            total[((x ^ y) >> 1) & 1] += counts ? counted : vec4(0.0);
         }
     }
     column_sums[0][column] = total[0];

@@ -10,6 +10,9 @@
 #ifndef TWO_SIDED
 #error Required define TWO_SIDED, 0 or 1: has any back side a map?
 #endif
+#ifndef PARTED
+#error Required define PARTED, 0 or 1: are only every so many pixels drawn, from a point of their own?
+#endif
 #if TWO_SIDED
 #define PIXEL vec4 // column and row on the atlas page: of the front side, of the back side
 #define FIRST ivec2
@@ -61,12 +64,18 @@ flat in FIRST first;
 
 uniform int resolution;    // of an atlas page
 uniform uint none;         // the entry of what has no light
+uniform int part;          // which pixel of each 2 × 2
 uniform vec2 depth;        // of 1 m, and what each octave of distance adds
 
 layout(location = 0) out uint entry;
 
 void main()
 {
+#if PARTED
+    ivec2 odd = ivec2(gl_FragCoord.xy) & 1;
+    if (odd.x + 2 * odd.y != part)
+        discard;
+#endif
 #if TWO_SIDED
     vec2 at = gl_FrontFacing ? pixel.xy : pixel.zw;
     int page = gl_FrontFacing ? first.x : first.y;

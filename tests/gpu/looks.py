@@ -57,7 +57,7 @@ class Look:
         return Eyes(
             points[:, 0], tangent * cosine + bitangent * sine, frame.normal[texel], frame.geometric_normal[texel],
             self.texels.instance[texel], points, np.ones(points.shape[:2], np.bool_),
-            np.zeros((len(texel), 2), np.float32),
+            np.zeros((len(texel), 2), np.float32), np.zeros(len(texel), np.bool_),
         )  # fmt: skip
 
     def drawn(self, eyes: Eyes) -> np.ndarray:

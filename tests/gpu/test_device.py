@@ -56,9 +56,9 @@ def test_all_rays_may_be_the_gpu_s(compute_gpu, photons: bool, mirror: bool) -> 
 
 
 def test_where_memory_ends_views_are_drawn_again_and_no_bit_changes(gpu, monkeypatch) -> None:
-    scene, atlas = cornell(12)
+    scene, atlas = cornell(6)
     states = [scene.first_frame()]
-    monkeypatch.setattr(view_gather, "SOFTWARE_SIDE", 64)  # many small targets
+    monkeypatch.setattr(view_gather, "SOFTWARE_SIDE", 96)  # many small targets
     (whole,) = lit(scene, atlas, states, gather="hemicube")
     made, make = [], view_gather._ViewTarget
 

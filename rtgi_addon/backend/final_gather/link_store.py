@@ -68,6 +68,10 @@ class LinkStore:
         """(n, POINTS) which points of each texel lie in its open part; not to be written to."""
         return self._opened
 
+    def near(self, texel: Int32, distance: Float32) -> Bool:
+        """(k,) does any cosine ray of ``texel`` (k,), all of them kept, end within ``distance`` (k,) m?"""
+        return np.asarray(self._distance[texel].min(axis=1, initial=np.inf) < distance)
+
     @property
     def bytes(self) -> int:
         """Memory that the kept links take."""

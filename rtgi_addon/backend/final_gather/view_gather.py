@@ -269,7 +269,7 @@ class ViewGather:
         cosine, sine = np.cos(turn), np.sin(turn)
         return Eyes(
             eye, tangent * cosine + bitangent * sine, normal, frame.geometric_normal[texel], texels.instance[texel],
-            points, opened, self._shift[texel],
+            points, opened, self._shift[texel], ~flat | self._opening.near(texel, 2 * frame.reach[texel]),
         )  # fmt: skip
 
     def _tilt(self, texel: Int32) -> Float32 | None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,8 @@ LEAST_VIEWS, FIRST_VIEWS, MOST_VIEWS = 16, 256, 4096
 #: Ranges of triangles that are drawn apart; nearer ones are drawn with what lies between them.
 MOST_RANGES = 32
 GL_CLIP_DISTANCE0 = 0x3000
+#: Points that a parted view is taken from: one in each 2 × 2 of its pixels.
+PARTS = 4
 #: An instance of a draw: eye, tangent, normal, tile.
 EYE = np.dtype([("eye", "f4", 3), ("tangent", "f4", 3), ("normal", "f4", 3), ("tile", "f4", 2)])
 
@@ -51,9 +53,17 @@ class Eyes:
     points: Float32  # (m, POINTS, 3) of the texel
     opened: Bool  # (m, POINTS) which of them lie in the open
     shift: Float32  # (m, 2) in [0, 1): what tells its rays from those of its neighbours
+    parted: Bool  # (m,) seen from PARTS of its points, each in every so many pixels: one does not stand for all
 
     def take(self, rows: NDArray[np.integer[Any]]) -> Eyes:
         return Eyes(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def from_point(self, number: int) -> Eyes:
+        """The same from point ``number`` of those in the open, in their order, which is spread."""
+        opened_first = np.argsort(~self.opened, axis=1, kind="stable")
+        turn = number % np.maximum(self.opened.sum(axis=1), 1)
+        rows = np.arange(len(turn))
+        return replace(self, eye=self.points[rows, opened_first[rows, turn]])
 
 
 class Target:
@@ -148,38 +158,32 @@ class ViewRaster:
                 self._eyes.write(bytes(EYE.itemsize))  # one tile: all of the target
                 self._erase(ctx, target, 1, target.size)
         for rows in _alike(self._has_coarse, eyes.instance):
-            done = 0
-            while done < len(rows):
-                part = rows[done : done + self._pace.items]
-                with self._pace.timed(len(part)), self._gpu.current() as ctx:
-                    self._draw(ctx, target, target.corners(tile[part]), eyes.take(part), cleared=cleared)
-                    ctx.finish()
-                done += len(part)
+            whole, parted = rows[~eyes.parted[rows]], rows[eyes.parted[rows]]
+            self._draw_paced(target, tile[whole], eyes.take(whole), None, erase=not cleared)
+            for part in range(PARTS):
+                of_part = eyes.take(parted).from_point(part)
+                self._draw_paced(target, tile[parted], of_part, part, erase=not cleared and part == 0)
 
     def release(self) -> None:
         """Give memory back."""
         self._triangles.release()
-        vertex_arrays = (self._drawing, self._clearing)
+        vertex_arrays = (*self._drawings, self._clearing)
         self._gpu.release(*vertex_arrays, self._order, self._eyes, self._directions, *self._depths.values())
 
     def _open(self) -> None:
         """Programs and buffers."""
-        self._program, self._clear = (
-            draw_program(self._gpu, "view", TWO_SIDED=self._triangles.two_sided),
-            draw_program(self._gpu, "background"),
-        )
+        two_sided = self._triangles.two_sided
+        self._programs = [draw_program(self._gpu, "view", TWO_SIDED=two_sided, PARTED=parted) for parted in (0, 1)]
+        self._clear = draw_program(self._gpu, "background")
         with self._gpu.current() as ctx:
             self._order = ctx.buffer(reserve=12 * max(self._triangles.count, 1))
             self._eyes = ctx.buffer(reserve=MOST_VIEWS * EYE.itemsize)
-            self._drawing = ctx.vertex_array(
-                self._program,
-                [
-                    (self._triangles.placed, "3f", "in_position"),
-                    (self._triangles.corner_rows, *CORNER_FORMAT[self._triangles.two_sided]),
-                    (self._eyes, "3f 3f 3f 2f/i", "in_eye", "in_tangent", "in_normal", "in_tile"),
-                ],
-                index_buffer=self._order,
-            )
+            read = [
+                (self._triangles.placed, "3f", "in_position"),
+                (self._triangles.corner_rows, *CORNER_FORMAT[two_sided]),
+                (self._eyes, "3f 3f 3f 2f/i", "in_eye", "in_tangent", "in_normal", "in_tile"),
+            ]
+            self._drawings = [ctx.vertex_array(program, read, index_buffer=self._order) for program in self._programs]
             away = [(self._eyes, "12x 3f 3f 2f/i", "in_tangent", "in_normal", "in_tile")]
             self._clearing = ctx.vertex_array(self._clear, away)
             self._directions = nearest_texture(ctx, padded(self._view.directions))
@@ -220,29 +224,40 @@ class ViewRaster:
         rows = rows[in_front(scenery.centre[rows], scenery.radius[rows], eyes.eye, eyes.normal)]
         return merged(scenery.begin[rows], scenery.end[rows], np.cumsum(~drawn)[rows])
 
-    def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes, *, cleared: bool) -> None:
+    def _draw_paced(self, target: Target, tile: Int32, eyes: Eyes, part: int | None, *, erase: bool) -> None:
+        """In pieces short enough for a driver's watchdog. ``part``: of parted views, whose pixels alone are drawn."""
+        done = 0
+        while done < len(tile):
+            rows = np.arange(done, min(done + self._pace.items, len(tile)))
+            with self._pace.timed(len(rows)), self._gpu.current() as ctx:
+                self._draw(ctx, target, target.corners(tile[rows]), eyes.take(rows), part, erase=erase)
+                ctx.finish()
+            done += len(rows)
+
+    def _draw(self, ctx: Any, target: Target, corner: Float32, eyes: Eyes, part: int | None, *, erase: bool) -> None:
         rows = np.zeros(len(corner), EYE)
         rows["eye"], rows["tangent"], rows["normal"], rows["tile"] = eyes.eye, eyes.tangent, eyes.normal, corner
         self._eyes.orphan()
         self._eyes.write(rows.tobytes())
         self._aim(ctx, target)
         ctx.enable(ctx.DEPTH_TEST)
-        if not cleared:
+        if erase:
             self._erase(ctx, target, len(rows), (self._view.width, self._view.height))
         ctx.depth_func = "<"
         ctx.front_face = "cw"  # the picture looks along the normal with the tangent to the right: a mirror image
         ranges = self._ranges(eyes)
+        program, drawing = self._programs[part is not None], self._drawings[part is not None]
         # Programs are shared by all views of the context: what one sets does not stay.
         set_uniforms(
-            self._program, resolution=self._resolution, none=self._entries.none, target=target.size,
-            depth=self._scenery.depth,
+            program, resolution=self._resolution, none=self._entries.none, target=target.size,
+            depth=self._scenery.depth, part=0 if part is None else part,
         )  # fmt: skip
         with _clipped(ctx):
             for face in self._view.faces:
                 axes = tuple(face.axes.T.reshape(-1))
-                set_uniforms(self._program, axes=axes, low=face.low, rectangle=face.rectangle)
+                set_uniforms(program, axes=axes, low=face.low, rectangle=face.rectangle)
                 for first, count in ranges:
-                    self._drawing.render(ctx.TRIANGLES, vertices=3 * count, first=3 * first, instances=len(rows))
+                    drawing.render(ctx.TRIANGLES, vertices=3 * count, first=3 * first, instances=len(rows))
         ctx.disable(ctx.DEPTH_TEST)
 
     def _erase(self, ctx: Any, target: Target, tiles: int, size: tuple[int, int]) -> None:

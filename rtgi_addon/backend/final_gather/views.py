@@ -77,16 +77,20 @@ def make_view(kind: Gather, size: int, enlargement: float = 2.0) -> View:
     else:
         raise ValueError(f"{kind}: not a view")
     weights = np.concatenate(parts, axis=0)
-    row, col = np.indices(weights.shape)
     directions = np.concatenate([_directions(face) for face in faces], axis=0)
-    return View(kind, faces, directions.astype(np.float32), weights.astype(np.float32), (row + col) % 2 == 1)
+    return View(kind, faces, directions.astype(np.float32), weights.astype(np.float32), _second(weights))
 
 
 def _rays_view(size: int) -> View:
     """Pixels that are rays by the cosine: all weigh alike. Which is which hangs on the texel, see rays.glsl."""
     weights = np.full((size, size), 1 / size**2, np.float32)
+    return View(Gather.RAYS, (), np.zeros((size, size, 3), np.float32), weights, _second(weights))
+
+
+def _second(weights: Float64 | Float32) -> Bool:
+    """(h, w) fields of one colour of a chessboard of 2 × 2 pixels."""
     row, col = np.indices(weights.shape)
-    return View(Gather.RAYS, (), np.zeros((size, size, 3), np.float32), weights, (row + col) % 2 == 1)
+    return np.asarray((row // 2 + col // 2) % 2 == 1)
 
 
 def coverage(kind: Gather, enlargement: float = 2.0) -> float:
