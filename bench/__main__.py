@@ -9,9 +9,11 @@ from collections.abc import Sequence
 
 from .animation import bench_frames, bench_larsen, bench_scaling, in_process
 from .document import PARTS
+from .gpu_gather import bench_gpu
 from .points import points_of
 from .report import write_report
 from .report_frames import write_frames, write_larsen, write_scaling
+from .report_gpu import write_gpu
 from .run import bench_scene
 from .table import ROOT, SCENES, BenchScene
 
@@ -35,6 +37,8 @@ def main() -> None:
         write_scaling(in_process(bench_scaling), DOCS)
     if "larsen" in wanted:
         write_larsen(in_process(bench_larsen), DOCS)
+    if "gpu" in wanted:
+        write_gpu(in_process(bench_gpu), DOCS)
 
 
 def _speed(scenes: Sequence[BenchScene], *, full: bool) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from .results import Machine
 
 #: In the document's order.
-PARTS = ("speed", "frames", "scaling", "larsen")
+PARTS = ("speed", "frames", "scaling", "larsen", "gpu")
 PLOTS = "benchmarks"
 _TITLE = "# Benchmarks\n\nWritten by `python -m bench`, each part in one run; `--only` runs some of them.\n"
 
@@ -33,10 +33,10 @@ def read_parts(text: str) -> dict[str, str]:
     return {name: body.strip() for name, body in zip(pieces[1::2], pieces[2::2], strict=True)}
 
 
-def machine_lines(machine: Machine) -> str:
-    """Two items of a list: what a part was measured on and with."""
+def machine_lines(machine: Machine, gpu: str = "no GPU used") -> str:
+    """Two items of a list: what a part was measured on and with; ``gpu``: which one, in words."""
     versions = ", ".join(f"{name} {version}" for name, version in machine.versions.items())
     return (
-        f"- **Machine:** {machine.processor}, {machine.threads} threads, no GPU used, {platform.system()}.\n"
+        f"- **Machine:** {machine.processor}, {machine.threads} threads, {gpu}, {platform.system()}.\n"
         f"- **Versions:** {versions}."
     )

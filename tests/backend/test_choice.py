@@ -17,7 +17,7 @@ from rtgi_addon.backend.final_gather.bright import bright_targets, bright_weight
 from rtgi_addon.backend.final_gather.choice import Choice, ChoiceFile, Makers, choose, scene_class
 from rtgi_addon.backend.final_gather.gather import GatherRays
 from rtgi_addon.backend.final_gather.radiosity import sent_by_targets
-from rtgi_addon.backend.final_gather.view_gather import view_size
+from rtgi_addon.backend.final_gather.views.view_gather import view_size
 from rtgi_addon.backend.gpu.context import GpuUnavailable
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.placed import PlacedScene

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.final_gather import clusters as clusters_module
-from rtgi_addon.backend.final_gather.clusters import Clusters, cluster_spheres, in_front, make_clusters
+from rtgi_addon.backend.final_gather.views import clusters as clusters_module
+from rtgi_addon.backend.final_gather.views.clusters import Clusters, cluster_spheres, in_front, make_clusters
 
 TRY = settings(max_examples=150, deadline=None, derandomize=True)
 

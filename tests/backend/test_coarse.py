@@ -13,7 +13,7 @@ from embreex.rtcore_scene import EmbreeScene
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rtgi_addon.backend.final_gather.coarse import CoarseMesh, coarse_mesh
+from rtgi_addon.backend.final_gather.views.coarse import CoarseMesh, coarse_mesh
 from rtgi_addon.backend.scene import Mesh
 from tests.backend import scenes
 

@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.final_gather.view_tables import DOES_NOT_COUNT
+from rtgi_addon.backend.final_gather.views.entries import DOES_NOT_COUNT
 from rtgi_addon.backend.gpu import programs
 from rtgi_addon.backend.gpu.compute_tracer import DEFINES
 from rtgi_addon.backend.gpu.context import COMPUTE_VERSION, LEAST_VERSION, GpuInfo, _info

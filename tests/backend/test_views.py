@@ -10,10 +10,9 @@ from hypothesis import strategies as st
 from scipy.integrate import dblquad
 
 from rtgi_addon.backend.final_gather.patterns import SETS, TILE
-from rtgi_addon.backend.final_gather.view_gather import _shifts, view_size
-from rtgi_addon.backend.final_gather.view_raster import MOST_RANGES, merged
-from rtgi_addon.backend.final_gather.view_tables import DOES_NOT_COUNT, NOTHING, Entries
-from rtgi_addon.backend.final_gather.views import (
+from rtgi_addon.backend.final_gather.views.entries import DOES_NOT_COUNT, NOTHING, Entries
+from rtgi_addon.backend.final_gather.views.raster import MOST_RANGES, merged
+from rtgi_addon.backend.final_gather.views.view import (
     LEAST_SIZE,
     MOST_SIZE,
     Face,
@@ -24,6 +23,7 @@ from rtgi_addon.backend.final_gather.views import (
     make_view,
     side_weights,
 )
+from rtgi_addon.backend.final_gather.views.view_gather import _shifts, view_size
 from rtgi_addon.backend.settings import SAMPLES_OF_QUALITY, Gather, Quality, SampleCounts
 
 TRY = settings(max_examples=60, deadline=None, derandomize=True)

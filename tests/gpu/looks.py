@@ -7,10 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from rtgi_addon.backend.final_gather.coarse import CoarseMesh
-from rtgi_addon.backend.final_gather.view_raster import Eyes, Target, ViewRaster
-from rtgi_addon.backend.final_gather.view_tables import make_entries
-from rtgi_addon.backend.final_gather.views import Face, View, make_view
+from rtgi_addon.backend.final_gather.views.coarse import CoarseMesh
+from rtgi_addon.backend.final_gather.views.entries import make_entries
+from rtgi_addon.backend.final_gather.views.raster import ViewRaster
+from rtgi_addon.backend.final_gather.views.target import Eyes, Target
+from rtgi_addon.backend.final_gather.views.view import Face, View, make_view
 from rtgi_addon.backend.gpu.context import Gpu
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.placed import PlacedScene

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.final_gather import view_gather
+from rtgi_addon.backend.final_gather.views import view_gather
 from rtgi_addon.backend.gpu.context import GpuFailed
 from rtgi_addon.backend.scene import FrameState, Scene
 from rtgi_addon.backend.session import FrameResult, Session

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 
 from bench import sequences
-from rtgi_addon.backend.final_gather import gathers, view_gather
+from rtgi_addon.backend.final_gather import gathers
 from rtgi_addon.backend.final_gather.gathers import Gathers
-from rtgi_addon.backend.final_gather.view_raster import ViewRaster
-from rtgi_addon.backend.final_gather.view_sums import ViewSums
+from rtgi_addon.backend.final_gather.views import view_gather
+from rtgi_addon.backend.final_gather.views.raster import ViewRaster
+from rtgi_addon.backend.final_gather.views.sums import ViewSums
 from rtgi_addon.backend.gpu import programs
 from rtgi_addon.backend.gpu.compute_tracer import ComputeTracer
 from rtgi_addon.backend.gpu.context import Gpu, GpuFailed, GpuUnavailable, open_gpu

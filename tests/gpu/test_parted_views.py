@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from rtgi_addon.backend.final_gather.gather import GatherRays
-from rtgi_addon.backend.final_gather.view_gather import ViewGather, nothing_bright
-from rtgi_addon.backend.final_gather.view_raster import PARTS
-from rtgi_addon.backend.final_gather.views import make_view
+from rtgi_addon.backend.final_gather.views.raster import PARTS
+from rtgi_addon.backend.final_gather.views.view import make_view
+from rtgi_addon.backend.final_gather.views.view_gather import ViewGather, nothing_bright
 from rtgi_addon.backend.parallel import Workers
 from rtgi_addon.backend.placed import PlacedScene
 from rtgi_addon.backend.settings import Gather, SampleCounts

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from bench.rooms import turned
-from rtgi_addon.backend.final_gather.view_raster import MOST_RANGES, Target
+from rtgi_addon.backend.final_gather.views.raster import MOST_RANGES
+from rtgi_addon.backend.final_gather.views.target import Target
 from rtgi_addon.backend.gpu.triangles import SceneTriangles, corners_of_scene
 from rtgi_addon.backend.scene import Atlas, Instance, Mesh, Placement, Scene, World
 from rtgi_addon.backend.settings import Gather

@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rtgi_addon.backend.final_gather.view_raster import Target
-from rtgi_addon.backend.final_gather.view_sums import ViewSums
-from rtgi_addon.backend.final_gather.view_tables import DOES_NOT_COUNT
-from rtgi_addon.backend.final_gather.views import View, make_view
+from rtgi_addon.backend.final_gather.views.entries import DOES_NOT_COUNT
+from rtgi_addon.backend.final_gather.views.sums import ViewSums
+from rtgi_addon.backend.final_gather.views.target import Target
+from rtgi_addon.backend.final_gather.views.view import View, make_view
 from rtgi_addon.backend.gpu.context import Gpu, GpuFailed
 from rtgi_addon.backend.gpu.tables import TABLE_WIDTH, Table
 from rtgi_addon.backend.settings import Gather

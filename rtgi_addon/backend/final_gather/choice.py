@@ -29,8 +29,8 @@ from ..settings import Gather, SampleCounts
 from .gather import NO_TARGET, GatherRays
 from .patterns import TILE
 from .products import row_products
-from .view_gather import ViewGather, view_size
-from .views import LEAST_SIZE, MOST_SIZE
+from .views.view import LEAST_SIZE, MOST_SIZE
+from .views.view_gather import ViewGather, view_size
 
 #: Tiles that are lit for a measurement; 384 texels tell times to a tenth and errors to a fifth.
 TILES = 24

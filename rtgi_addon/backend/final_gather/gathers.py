@@ -21,12 +21,12 @@ from ..surface.geometry import Geometry
 from ..surface.tracing import EmbreeTracer, FollowingTracer
 from .bright import BrightTargets
 from .choice import Choice, ChoiceFile, Makers, choose, scene_class
-from .coarse import CoarseMesh, coarse_mesh
 from .gather import GatherRays
 from .kept_gather import KeptGather
 from .link_gather import LinkGather
-from .view_gather import ViewGather, view_size
-from .views import LEAST_SIZE, MOST_SIZE, make_view
+from .views.coarse import CoarseMesh, coarse_mesh
+from .views.view import LEAST_SIZE, MOST_SIZE, make_view
+from .views.view_gather import ViewGather, view_size
 
 
 class Gathers:

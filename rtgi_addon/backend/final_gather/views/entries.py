@@ -11,9 +11,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..lamps.sky import Sky
-from ..scene import Float32, Int32
-from ..surface.texels import Texels
+from ...lamps.sky import Sky
+from ...scene import Float32, Int32
+from ...surface.texels import Texels
 
 #: A target's number where there is none: black, but seen.
 NOTHING = -1

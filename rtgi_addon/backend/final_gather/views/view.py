@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..scene import Bool, Float32, Float64
-from ..settings import Gather
+from ...scene import Bool, Float32, Float64
+from ...settings import Gather
 
 #: Pixels along a side of a view: fewer cannot be halved, more than that is finer than any light map.
 LEAST_SIZE, MOST_SIZE = 8, 256

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from ..gpu.context import Gpu
-from ..gpu.programs import compute_program, draw_program, set_uniforms
-from ..gpu.tables import Table
-from ..scene import Float32
-from .view_raster import Target, nearest_texture, padded
-from .views import View
+from ...gpu.context import Gpu
+from ...gpu.programs import compute_program, draw_program, set_uniforms
+from ...gpu.tables import Table
+from ...scene import Float32
+from .target import Target, nearest_texture, padded
+from .view import View
 
 #: Texture units of the passes "sum" and "weigh".
 UNITS = {"entries": 0, "sent": 1, "weights": 2, "directions": 3, "triangle": 4}

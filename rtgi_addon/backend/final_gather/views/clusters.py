@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene import Bool, Float32, Float64, Int32
+from ...scene import Bool, Float32, Float64, Int32
 
 Int64 = NDArray[np.int64]
 

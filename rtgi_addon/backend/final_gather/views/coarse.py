@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from ..scene import Bool, Float32, Float64, Int32, Mesh
-from ..surface.geometry import triangle_normals, unit
+from ...scene import Bool, Float32, Float64, Int32, Mesh
+from ...surface.geometry import triangle_normals, unit
 
 Int64 = NDArray[np.int64]
 

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """Views by rays in a compute shader: as many rays by the cosine as a view has pixels, none of which leaves the GPU.
 
-A tile holds what its texel's rays meet, as :mod:`.view_raster` fills it with what the texel's pixels show; every ray
+A tile holds what its texel's rays meet, as :mod:`.raster` fills it with what the texel's pixels show; every ray
 has the same weight. Needs OpenGL 4.3.
 """
 
@@ -12,17 +12,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.compute_tracer import DEFINES, FIRST_FREE_BINDING, ComputeTracer
-from ..gpu.context import Gpu, GpuFailed
-from ..gpu.pace import Pace
-from ..gpu.programs import compute_program, set_uniforms
-from ..scene import FrameState, Int32
-from ..surface.geometry import Geometry
-from ..surface.rasterise import POINTS
-from ..surface.texels import Texels
-from .view_raster import Eyes, Target
-from .view_tables import Entries
-from .views import View
+from ...gpu.compute_tracer import DEFINES, FIRST_FREE_BINDING, ComputeTracer
+from ...gpu.context import Gpu, GpuFailed
+from ...gpu.pace import Pace
+from ...gpu.programs import compute_program, set_uniforms
+from ...scene import FrameState, Int32
+from ...surface.geometry import Geometry
+from ...surface.rasterise import POINTS
+from ...surface.texels import Texels
+from .entries import Entries
+from .target import Eyes, Target
+from .view import View
 
 #: As ``Texel``, ``Side`` of rays.glsl lie in std430.
 TEXEL = np.dtype(

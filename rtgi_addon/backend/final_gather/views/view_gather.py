@@ -14,28 +14,29 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ..gpu.compute_tracer import ComputeTracer
-from ..gpu.context import Gpu, GpuFailed
-from ..parallel import Workers
-from ..placed import PlacedScene
-from ..sampling import dot, frames, hash_keys, unit_float32
-from ..scene import Bool, Float32, FrameState, Int32
-from ..selection.changes import Change
-from ..settings import Gather, SampleCounts
-from ..surface.texels import stand_ins
-from .bright import BrightTargets
+from ...gpu.compute_tracer import ComputeTracer
+from ...gpu.context import Gpu, GpuFailed
+from ...parallel import Workers
+from ...placed import PlacedScene
+from ...sampling import dot, frames, hash_keys, unit_float32
+from ...scene import Bool, Float32, FrameState, Int32
+from ...selection.changes import Change
+from ...settings import Gather, SampleCounts
+from ...surface.texels import stand_ins
+from ..bright import BrightTargets
+from ..gather import GatherRays
+from ..kept_gather import GatherWork
+from ..link_store import LinkStore
+from ..links import MOST_HALF_SCALE
+from ..openness import open_texels
+from ..patterns import TILE, pattern_of_texels
 from .coarse import CoarseMesh
-from .gather import GatherRays
-from .kept_gather import GatherWork
-from .link_store import LinkStore
-from .links import MOST_HALF_SCALE
-from .openness import open_texels
-from .patterns import TILE, pattern_of_texels
-from .view_raster import Eyes, Target, ViewRaster
-from .view_rays import ViewRays
-from .view_sums import ViewSums
-from .view_tables import NOTHING, make_entries
-from .views import LEAST_SIZE, MOST_SIZE, View
+from .entries import NOTHING, make_entries
+from .raster import ViewRaster
+from .rays import ViewRays
+from .sums import ViewSums
+from .target import Eyes, Target
+from .view import LEAST_SIZE, MOST_SIZE, View
 
 #: Rays of a texel that tell which of its points lie in the open.
 PROBES = SampleCounts(32, 0)
@@ -70,7 +71,7 @@ class ViewSource(Protocol):
 
 
 class ViewGather:
-    """The :class:`~.kept_gather.KeptGather` by views. All calls from one thread."""
+    """The :class:`~..kept_gather.KeptGather` by views. All calls from one thread."""
 
     def __init__(
         self, placed: PlacedScene, gpu: Gpu, view: View, workers: Workers,
@@ -284,7 +285,7 @@ class ViewGather:
 
 @dataclass(frozen=True)
 class ViewIrradiance:
-    """The :class:`~.kept_gather.Irradiance` by views, of r texels."""
+    """The :class:`~..kept_gather.Irradiance` by views, of r texels."""
 
     stand_in: Int32
     _gather: ViewGather
