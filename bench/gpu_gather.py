@@ -137,7 +137,7 @@ def _timed(about: GatherTime, gpu: Gpu, placed: PlacedScene, sent: Float32) -> G
         gather = make_gather(gpu, placed, about.kind, about.size)
     except GpuFailed as fault:
         return replace(about, skipped=str(fault))
-    drawing, everything = watch(gather), anew(placed)
+    drawing, everything = watch(gather, one_point=True), anew(placed)
 
     def draw(texels: Int32) -> float:
         """Seconds a texel."""

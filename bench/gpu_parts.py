@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +38,8 @@ REPEATS = 3
 class Drawing:
     """What fills a gather's views, and how long that took."""
 
-    def __init__(self, source: ViewSource) -> None:
-        self._source = source
+    def __init__(self, source: ViewSource, *, one_point: bool) -> None:
+        self._source, self._one_point = source, one_point
         self.seconds = 0.0
         self.target: Target | None = None  # that was drawn first
 
@@ -46,6 +47,8 @@ class Drawing:
         self._source.follow(moved, state)
 
     def draw(self, target: Target, tile: Int32, eyes: Eyes) -> None:
+        if self._one_point:
+            eyes = replace(eyes, parted=np.zeros(len(tile), np.bool_))
         start = time.perf_counter()
         self._source.draw(target, tile, eyes)  # waits for the device
         self.seconds += time.perf_counter() - start
@@ -55,9 +58,10 @@ class Drawing:
         self._source.release()
 
 
-def watch(gather: ViewGather) -> Drawing:
-    """Time the drawing of ``gather``, which else times nothing, apart from what the CPU does before it."""
-    gather._source = drawing = Drawing(gather._source)
+def watch(gather: ViewGather, *, one_point: bool = False) -> Drawing:
+    """Time the drawing of ``gather``, which else times nothing, apart from what the CPU does before it. ``one_point``:
+    no view is from four points, whatever is near: each texel is one view, as in the paper."""
+    gather._source = drawing = Drawing(gather._source, one_point=one_point)
     return drawing
 
 

@@ -46,6 +46,8 @@ SOFTWARE_SIDE, HARDWARE_SIDE = 1024, 4096
 SPARED_TARGETS = 3
 #: Normals of a flat texel's points, and of a texel and its triangle, differ by less.
 FLAT = np.float32(1e-4)
+#: Cosine below which two normals of a texel's points are of different sides of an edge: 26°.
+ALIKE = np.float32(0.9)
 
 
 def view_size(samples: SampleCounts) -> int:
@@ -270,8 +272,15 @@ class ViewGather:
         cosine, sine = np.cos(turn), np.sin(turn)
         return Eyes(
             eye, tangent * cosine + bitangent * sine, normal, frame.geometric_normal[texel], texels.instance[texel],
-            points, opened, self._shift[texel], ~flat | self._opening.near(texel, 2 * frame.reach[texel]),
+            points, opened, self._shift[texel], self._parted(texel, normals, opened),
         )  # fmt: skip
+
+    def _parted(self, texel: Int32, normals: Float32, opened: Bool) -> Bool:
+        """(m,) does light change too much over ``texel`` for one point to stand for it: about an edge, partly under
+        other geometry, or beside such? normals (m, POINTS, 3) and opened (m, POINTS) of its points."""
+        about_edge = ((normals * normals[:, :1]).sum(axis=2) < ALIKE).any(axis=1)
+        near = self._opening.near(texel, 2 * self._placed.frame.reach[texel])
+        return np.asarray(about_edge | ~opened.all(axis=1) | near)
 
     def _tilt(self, texel: Int32) -> Float32 | None:
         """(m, 4) normals of the own triangles of ``texel`` (m,), tangent space; None where no texel's is tilted."""
