@@ -195,6 +195,8 @@ class Gathers:
         names = passing_materials(placed)
         left_out = [f"{names}: gather {self.gather} {_PASSING}"] if names else []
         left_out += [_GRAZING] if self.gather is Gather.PLANE else []
+        if self._gpu is not None and self._settings.device is Device.GPU and not self._gpu.info.computes:
+            left_out.append(f"{self._gpu.info.renderer}: has no compute shaders; the CPU traces what rays there are")
         return [*self.notes, *left_out]
 
     def stand_ins(self, placed: PlacedScene) -> dict[str, dict[str, float]]:
