@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from bench import sequences
 from bench.rooms import turned
 from bench.sequences import FrameSequence
-from rtgi_addon.backend.final_gather import lighting
+from rtgi_addon.backend.final_gather import link_gather
 from rtgi_addon.backend.final_gather.link_store import LinkStore
 from rtgi_addon.backend.finish.oidn import find_oidn
 from rtgi_addon.backend.parallel import Workers
@@ -169,7 +169,7 @@ def test_links_that_are_not_kept(name: str, share: float, monkeypatch: pytest.Mo
         stores.append(LinkStore(rays, workers, memory=int(share * whole.bytes)))
         return stores[-1]
 
-    monkeypatch.setattr(lighting, "LinkStore", limited)
+    monkeypatch.setattr(link_gather, "LinkStore", limited)
     results = assert_lawful(story, choice, order=order, alone=(13,))
     assert stores and all(0 <= s.kept <= share * s.count for s in stores)
     for some, every in zip(results, kept_all, strict=True):
