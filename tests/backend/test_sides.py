@@ -209,7 +209,7 @@ def test_unchanging_states_cost_nothing() -> None:
     one = lit_sides(scene, states[:1])
     middle = time.process_time()
     assert np.array_equal(one, lit_sides(scene, states))
-    assert time.process_time() - middle < 3 * (middle - start) + 1
+    assert time.process_time() - middle < 3 * (middle - start) + 0.1
 
 
 def test_light_through_a_small_window() -> None:
@@ -289,4 +289,4 @@ def test_thousand_instances_take_about_a_second() -> None:
     scene = Scene((crate, room), (*instances, Instance("room", 1, np.eye(4))), (WHITE,), (point_light((0, 0, 0)),))
     start = time.process_time()
     assert sides(scene) == "F" * 1001
-    assert time.process_time() - start < 30  # a hang, not a slow machine: 0.5 s on a quiet core
+    assert time.process_time() - start < 4.0  # 0.5 s on a quiet core

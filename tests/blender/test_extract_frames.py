@@ -305,5 +305,5 @@ def test_130k_triangles_with_movers_cost_little_a_frame(add_cube: AddObject) -> 
         at(source, frame)
         times.append(time.perf_counter() - start)
     print(f"frame_set and frame_state: {1e3 * np.median(times):.1f} ms")  # noqa: T201
-    # 60 ms is the aim on a quiet machine; of a slow one, the best of ten says that nothing grew out of bounds.
-    assert min(times) < 0.3
+    # 60 ms is the aim on a quiet machine; the best of ten is what other work on it does not hide.
+    assert min(times) < 0.060

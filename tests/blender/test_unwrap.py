@@ -377,7 +377,7 @@ def test_half_a_million_triangles_in_time() -> None:
     )
     start = time.process_time()
     layout, warnings = unwrap(source)
-    assert time.process_time() - start < 120  # a hang, not a slow machine: 5 s on a quiet core
+    assert time.process_time() - start < 25  # 5 s on a quiet core
     assert warnings == [] and layout.island_of_triangle.max() < 50
 
 

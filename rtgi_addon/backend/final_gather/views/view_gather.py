@@ -149,7 +149,8 @@ class ViewGather:
         first = 0
         for kept in self._targets:
             mine = texel[(texel >= first) & (texel < first + kept.target.tiles)]
-            kept.draw(self._source, mine - first, self._eyes(mine), self._tilt(mine))
+            eyes = self._eyes(mine)
+            kept.draw(self._source, mine - first, eyes, self._tilt(eyes))
             first += kept.target.tiles
         self._pending[texel] = False
         return work
@@ -225,7 +226,8 @@ class ViewGather:
         if self._spare is None:
             self._spare = _ViewTarget(self._gpu, self._fitting(self.count), self._tilted)
         tile = np.arange(len(texel), dtype=np.int32)
-        self._spare.draw(self._source, tile, self._eyes(texel), self._tilt(texel))
+        eyes = self._eyes(texel)
+        self._spare.draw(self._source, tile, eyes, self._tilt(eyes))
         return [sums[: len(texel)] for sums in self._sums.sums(self._spare.target, self._spare.triangle)]
 
     def _make_targets(self, memory: int) -> list[_ViewTarget]:
@@ -282,14 +284,13 @@ class ViewGather:
         near = self._opening.near(texel, 2 * self._placed.frame.reach[texel])
         return np.asarray(about_edge | ~opened.all(axis=1) | near)
 
-    def _tilt(self, texel: Int32) -> Float32 | None:
-        """(m, 4) normals of the own triangles of ``texel`` (m,), tangent space; None where no texel's is tilted."""
+    def _tilt(self, eyes: Eyes) -> Float32 | None:
+        """(m, 4) normals of the own triangles of ``eyes`` (m,), tangent space; None where no texel's is tilted."""
         if not self._tilted:
             return None
-        eyes = self._eyes(texel)
         across = np.cross(eyes.normal, eyes.tangent).astype(np.float32)
         parts = [dot(eyes.own, axis) for axis in (eyes.tangent, across, eyes.normal)]
-        return np.asarray(np.stack([*parts, np.zeros(len(texel), np.float32)], axis=1), np.float32)
+        return np.asarray(np.stack([*parts, np.zeros(len(across), np.float32)], axis=1), np.float32)
 
 
 @dataclass(frozen=True)
