@@ -295,7 +295,7 @@ def test_200_000_triangles_in_time() -> None:
     assert fine.triangle_count == 2 * n * n
     assert results[1].mean(0) == pytest.approx(results[0].mean(0), rel=0.01)
     assert results[1].mean(1) == pytest.approx(results[0].mean(1), rel=0.05)
-    assert seconds < 60  # a hang, not a slow machine: about 2 on a quiet core
+    assert seconds < 10  # takes about 2 on one core
 
 
 @pytest.mark.parametrize("bounced", [AimBounced.FEEDBACK, AimBounced.PHOTONS])
